@@ -1,0 +1,248 @@
+"""Signals: closed-form functions of space with exact gradients. They are Fields, so they render as ground truth.
+
+Every signal has a box (its domain); `sample` turns it into a Volume whose voxels tile that box.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from filterlab.fields.base import Domain, Field, check_order, check_points
+from filterlab.volume import Geometry, Volume
+
+ValueAndGradient = Callable[[Tensor], tuple[Tensor, Tensor]]
+Corner = tuple[float, float, float]
+
+
+class Signal(Field):
+    """A closed-form function of space.
+
+    Args:
+        name: what error messages and reports call it.
+        value_and_gradient: points `(..., 3)` -> (value `(...)`, exact gradient `(..., 3)`), differentiable torch code.
+        lower, upper: corners of the box it is looked at in, x, y, z.
+        voxel_size: nominal voxel edge, the unit of a renderer's step; default 1/64 of the longest edge of the box.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        value_and_gradient: ValueAndGradient,
+        lower: Corner = (-1.0, -1.0, -1.0),
+        upper: Corner = (1.0, 1.0, 1.0),
+        voxel_size: float | None = None,
+    ) -> None:
+        self.name = name
+        self._function = value_and_gradient
+        size = voxel_size or max(b - a for a, b in zip(lower, upper, strict=True)) / 64
+        self.domain = Domain(lower, upper, Geometry(), size)
+
+    def with_voxel_size(self, voxel_size: float) -> Signal:
+        """The same signal with another nominal voxel edge."""
+        return Signal(self.name, self._function, self.domain.lower, self.domain.upper, voxel_size)
+
+    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+        """Value, exact gradient and (by automatic differentiation of the gradient) Hessian."""
+        check_order(order, self.max_order)
+        points = check_points(points, None)
+        if order == 2:
+            value, gradient = self._function(points)
+            return value, gradient, _jacobian(lambda p: self._function(p)[1], points)
+        return self._function(points)[: order + 1]
+
+    def sample(
+        self,
+        n: int | Sequence[int],
+        *,
+        centering: Literal["cell", "node"] = "cell",
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> Volume:
+        """The signal sampled on a grid of n (or (nx, ny, nz)) voxels, as a Volume with geometry.
+
+        centering="cell": voxels tile the box, centres half a voxel inside its faces; "node": the first and last voxel
+        centres lie on the faces (needs n ≥ 2).
+        """
+        size = (n, n, n) if isinstance(n, int) else tuple(int(k) for k in n)
+        least = 2 if centering == "node" else 1
+        if len(size) != 3 or min(size) < least:
+            raise ValueError(f"n must be one or three integers ≥ {least} for {centering} centering; got {n!r}")
+        if centering not in ("cell", "node"):
+            raise ValueError(f"centering must be 'cell' or 'node'; got {centering!r}")
+        extent = [b - a for a, b in zip(self.domain.lower, self.domain.upper, strict=True)]
+        inset = 0.5 if centering == "cell" else 0.0
+        spacing = [e / (k - 1 + 2 * inset) for e, k in zip(extent, size, strict=True)]
+        origin = [a + inset * s for a, s in zip(self.domain.lower, spacing, strict=True)]
+        axes = [
+            o + s * torch.arange(k, dtype=torch.float64, device=device)
+            for o, s, k in zip(origin, spacing, size, strict=True)
+        ]
+        planes = [  # one z-plane at a time: the float64 points of a large grid would be 24 bytes a voxel
+            self(torch.stack(torch.broadcast_tensors(axes[0], axes[1][:, None], z), -1)).to(dtype) for z in axes[2]
+        ]
+        return Volume(torch.stack(planes), spacing=spacing, origin=origin)
+
+
+def _jacobian(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
+    """d function_i / d point_j of a pointwise function, `(..., 3)` -> `(..., 3, 3)`; differentiable again."""
+    columns = []
+    for axis in range(3):
+        direction = torch.zeros_like(points)
+        direction[..., axis] = 1
+        columns.append(torch.func.jvp(function, (points,), (direction,))[1])
+    return torch.stack(columns, -1)
+
+
+def marschner_lobb(frequency: float = 6.0, alpha: float = 0.25, voxel_size: float | None = None) -> Signal:
+    """The test signal of Marschner & Lobb on [−1, 1]³.
+
+    ρ(x, y, z) = (1 − sin(πz/2) + α (1 + ρ_r(√(x²+y²)))) / (2 (1 + α)),  ρ_r(r) = cos(2π f_M cos(πr/2)).
+
+    Source: Marschner & Lobb, An evaluation of reconstruction filters for volume rendering, 1994 (f_M = 6, α = 0.25).
+    """
+
+    def function(p: Tensor) -> tuple[Tensor, Tensor]:
+        x, y, z = p.unbind(-1)
+        scale = 1 / (2 * (1 + alpha))
+        squared = x * x + y * y
+        r = squared.clamp_min(torch.finfo(p.dtype).tiny).sqrt()
+        phase = 2 * math.pi * frequency * torch.cos(math.pi / 2 * r)
+        # d phase / d r divided by r is finite at r = 0: −2π f (π/2)² sinc(r/2)
+        slope_over_r = -2 * math.pi * frequency * (math.pi / 2) ** 2 * torch.sinc(r / 2)
+        value = scale * (1 - torch.sin(math.pi / 2 * z) + alpha * (1 + torch.cos(phase)))
+        radial = -scale * alpha * torch.sin(phase) * slope_over_r
+        along_z = -scale * math.pi / 2 * torch.cos(math.pi / 2 * z)
+        return value, torch.stack((radial * x, radial * y, along_z), -1)
+
+    return Signal("marschner-lobb", function, voxel_size=voxel_size)
+
+
+def franke(voxel_size: float | None = None) -> Signal:
+    """Franke's test function extended to three variables, on [0, 1]³: a sum of four Gaussians.
+
+    f = ¾ e^{−((9x−2)² + (9y−2)² + (9z−2)²)/4} + ¾ e^{−(9x+1)²/49 − (9y+1)/10 − (9z+1)/10}
+      + ½ e^{−((9x−7)² + (9y−3)² + (9z−5)²)/4} − ⅕ e^{−(9x−4)² − (9y−7)² − (9z−5)²}
+
+    Source: Renka, Multivariate interpolation of large sets of scattered data, 1988 (its trivariate test function 1).
+    """
+    # value of each term: height · exp(−Σ_d rate_d (9 x_d − shift_d)^power_d)
+    terms = (
+        (0.75, (0.25, 0.25, 0.25), (2, 2, 2), (2, 2, 2)),
+        (0.75, (1 / 49, 0.1, 0.1), (-1, -1, -1), (2, 1, 1)),
+        (0.5, (0.25, 0.25, 0.25), (7, 3, 5), (2, 2, 2)),
+        (-0.2, (1.0, 1.0, 1.0), (4, 7, 5), (2, 2, 2)),
+    )
+
+    def function(p: Tensor) -> tuple[Tensor, Tensor]:
+        value, gradient = torch.zeros_like(p[..., 0]), torch.zeros_like(p)
+        for height, rates, shifts, powers in terms:
+            rate, shift, power = p.new_tensor(rates), p.new_tensor(shifts), p.new_tensor(powers)
+            u = 9 * p - shift
+            squared = power == 2
+            term = height * torch.exp(-(rate * torch.where(squared, u * u, u)).sum(-1))
+            value = value + term
+            gradient = gradient - 9 * term[..., None] * rate * torch.where(squared, 2 * u, torch.ones_like(u))
+        return value, gradient
+
+    return Signal("franke", function, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), voxel_size)
+
+
+def polynomial(
+    coefficients: dict[tuple[int, int, int], float],
+    lower: Corner = (-1.0, -1.0, -1.0),
+    upper: Corner = (1.0, 1.0, 1.0),
+    voxel_size: float | None = None,
+) -> Signal:
+    """Σ c_{ijk} x^i y^j z^k with `coefficients` = {(i, j, k): c}; what a method reproduces is measured with it."""
+
+    def function(p: Tensor) -> tuple[Tensor, Tensor]:
+        x, y, z = p.unbind(-1)
+        value, gradient = torch.zeros_like(x), [torch.zeros_like(x) for _ in range(3)]
+        for (i, j, k), c in coefficients.items():
+            value = value + c * x**i * y**j * z**k
+            if i:
+                gradient[0] = gradient[0] + c * i * x ** (i - 1) * y**j * z**k
+            if j:
+                gradient[1] = gradient[1] + c * j * x**i * y ** (j - 1) * z**k
+            if k:
+                gradient[2] = gradient[2] + c * k * x**i * y**j * z ** (k - 1)
+        return value, torch.stack(gradient, -1)
+
+    return Signal("polynomial", function, lower, upper, voxel_size)
+
+
+def sphere(
+    radius: float = 0.6, center: Corner = (0.0, 0.0, 0.0), edge: float = 0.1, voxel_size: float | None = None
+) -> Signal:
+    """A solid ball with a smooth edge on [−1, 1]³: f = ½ (1 − erf((|p − c| − radius) / edge)).
+
+    `edge` is the width of the blur, in world units. The gradient points to the centre; at the centre itself it is 0.
+    """
+
+    def function(p: Tensor) -> tuple[Tensor, Tensor]:
+        d = p - p.new_tensor(center)
+        r = (d * d).sum(-1).clamp_min(torch.finfo(p.dtype).tiny).sqrt()
+        u = (r - radius) / edge
+        slope = -torch.exp(-u * u) / (math.sqrt(math.pi) * edge)
+        return 0.5 * torch.erfc(u), (slope / r)[..., None] * d
+
+    return Signal("sphere", function, voxel_size=voxel_size)
+
+
+def sphere_distance(
+    radius: float = 0.6, center: Corner = (0.0, 0.0, 0.0), voxel_size: float | None = None
+) -> Signal:
+    """The signed distance to a sphere on [−1, 1]³, negative inside: |p − c| − radius."""
+
+    def function(p: Tensor) -> tuple[Tensor, Tensor]:
+        d = p - p.new_tensor(center)
+        r = (d * d).sum(-1).clamp_min(torch.finfo(p.dtype).tiny).sqrt()
+        return r - radius, d / r[..., None]
+
+    return Signal("sphere-distance", function, voxel_size=voxel_size)
+
+
+def gaussian(sigma: float = 0.3, center: Corner = (0.0, 0.0, 0.0), voxel_size: float | None = None) -> Signal:
+    """exp(−|p − c|² / (2σ²)) on [−1, 1]³: smooth, so that every method shows its order early."""
+
+    def function(p: Tensor) -> tuple[Tensor, Tensor]:
+        d = p - p.new_tensor(center)
+        value = torch.exp(-(d * d).sum(-1) / (2 * sigma * sigma))
+        return value, -value[..., None] * d / (sigma * sigma)
+
+    return Signal("gaussian", function, voxel_size=voxel_size)
+
+
+def plane_wave(
+    wave_vector: Corner = (4.0, 2.0, 1.0), phase: float = 0.0, voxel_size: float | None = None
+) -> Signal:
+    """cos(k · p + phase) on [−1, 1]³ with k in radians per world unit: one frequency, for response measurements."""
+
+    def function(p: Tensor) -> tuple[Tensor, Tensor]:
+        k = p.new_tensor(wave_vector)
+        angle = p @ k + phase
+        return torch.cos(angle), -torch.sin(angle)[..., None] * k
+
+    return Signal("plane-wave", function, voxel_size=voxel_size)
+
+
+SIGNALS: dict[str, Callable[..., Signal]] = {
+    "marschner-lobb": marschner_lobb,
+    "franke": franke,
+    "sphere": sphere,
+    "sphere-distance": sphere_distance,
+    "gaussian": gaussian,
+    "plane-wave": plane_wave,
+}
+
+
+def named(name: str, **parameters: float) -> Signal:
+    """The signal of that name. Raises ValueError that lists the known names."""
+    if name not in SIGNALS:
+        raise ValueError(f"unknown signal {name!r}; known signals: {', '.join(SIGNALS)}")
+    return SIGNALS[name](**parameters)

@@ -1,0 +1,342 @@
+"""Volumes: samples on a regular grid, where the grid lies in the world, and how it goes on beyond its ends.
+
+Letters used in this file and everywhere else: samples are `(D, H, W)` or `(N, C, D, H, W)`; x runs along W, y along H,
+z along D. Points, spacings and origins are in x, y, z order; only tensor shapes are in D, H, W order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class Boundary(StrEnum):
+    """How the samples a b c d of an axis go on beyond its ends. Prefilter and evaluator share it.
+
+    ========  ===========================  ======================  ==============================================
+    name      extension                    scipy.ndimage           torch grid_sample
+    ========  ===========================  ======================  ==============================================
+    mirror    d c b | a b c d | c b a      mirror                  reflection, align_corners=True
+    reflect   d c b a | a b c d | d c b a  reflect                 reflection, align_corners=False
+    wrap      a b c d | a b c d | a b c d  grid-wrap               -
+    border    a a a a | a b c d | d d d d  nearest                 border
+    zeros     0 0 0 0 | a b c d | 0 0 0 0  grid-constant           zeros
+    ========  ===========================  ======================  ==============================================
+    """
+
+    MIRROR = "mirror"
+    REFLECT = "reflect"
+    WRAP = "wrap"
+    BORDER = "border"
+    ZEROS = "zeros"
+
+    @classmethod
+    def named(cls, name: str | Boundary) -> Boundary:
+        """The boundary of that name. Raises ValueError that lists the known names."""
+        try:
+            return cls(name)
+        except ValueError:
+            raise ValueError(f"boundary must be one of {', '.join(cls)}; got {name!r}") from None
+
+    @property
+    def periodic(self) -> bool:
+        """True where the extended samples repeat (mirror, reflect, wrap): points can be folded into one period."""
+        return self in (Boundary.MIRROR, Boundary.REFLECT, Boundary.WRAP)
+
+    def source(self, index: Tensor, n: int) -> Tensor:
+        """The sample in 0 … n−1 that stands at each integer `index` of the extended axis (for zeros: the nearest)."""
+        match self:
+            case Boundary.MIRROR:
+                period = max(2 * n - 2, 1)
+                index = index.remainder(period)
+                return torch.where(index < n, index, period - index)
+            case Boundary.REFLECT:
+                index = index.remainder(2 * n)
+                return torch.where(index < n, index, 2 * n - 1 - index)
+            case Boundary.WRAP:
+                return index.remainder(n)
+            case _:
+                return index.clamp(0, n - 1)
+
+    def extend(self, x: Tensor, dim: int, before: int, after: int) -> Tensor:
+        """`x` with its axis `dim` extended by `before` and `after` samples; differentiable in `x`."""
+        n = x.shape[dim]
+        index = torch.arange(-before, n + after, device=x.device)
+        out = x.index_select(dim, self.source(index, n))
+        if self is Boundary.ZEROS:
+            inside = ((index >= 0) & (index < n)).reshape([-1 if d == dim % x.ndim else 1 for d in range(x.ndim)])
+            out = torch.where(inside, out, torch.zeros((), dtype=x.dtype, device=x.device))
+        return out
+
+    def fold(self, x: Tensor, n: int, tail: int) -> tuple[Tensor, Tensor]:
+        """Coordinates folded or clamped to where coefficients are stored, and the derivative d folded / d x.
+
+        Args:
+            x: coordinates along one axis, in voxels; any finite value folds exactly (fmod); ±inf gives NaN under the
+                periodic boundaries and clamps under border and zeros.
+            n: voxels along the axis.
+            tail: how far beyond the ends coefficients are stored (border and zeros).
+
+        Returns:
+            (folded, sign): folded lies in [0, n−1] (mirror), [−½, n−½] (reflect), [0, n] (wrap) or
+            [−tail, n−1+tail]; points already there are returned bit for bit. sign is +1, −1 where a reflection turned
+            the axis round, 0 where the extension is constant.
+        """
+        one = torch.ones_like(x)
+        match self:
+            case Boundary.MIRROR if n == 1:
+                return torch.where(x.isfinite(), torch.zeros_like(x), torch.full_like(x, torch.nan)), 0 * one
+            case Boundary.MIRROR:
+                return _reflect_at(x, 0.0, n - 1.0)
+            case Boundary.REFLECT:
+                return _reflect_at(x, -0.5, n - 0.5)
+            case Boundary.WRAP:
+                return torch.where((x >= 0) & (x <= n), x, x.remainder(float(n))), one
+            case _:
+                low, high = -float(tail), n - 1.0 + tail
+                return x.clamp(low, high), torch.where((x < low) | (x > high), 0 * one, one)
+
+
+def _reflect_at(x: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
+    """x reflected at `low` and `high` until it lies between, and ±1 = d reflected / d x."""
+    period = 2 * (high - low)
+    inside = (x >= low) & (x <= high)
+    r = x.fmod(period) - low  # fmod first: it is exact, so 1e8 folds as exactly as 1
+    r = torch.where(r < 0, r + period, r)
+    r = torch.where(r >= period, r - period, r)
+    rising = r <= high - low
+    folded = torch.where(rising, r, period - r) + low
+    sign = torch.where(inside | rising, torch.ones_like(x), -torch.ones_like(x))
+    return torch.where(inside, x, folded), sign
+
+
+def _triple(name: str, value: Sequence[float] | Tensor | np.ndarray | float) -> tuple[float, float, float]:
+    values = np.asarray(value, dtype=np.float64)
+    if values.ndim == 0:
+        values = np.repeat(values, 3)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise ValueError(f"{name} must be three finite numbers in x, y, z order; got {value!r}")
+    return tuple(values.tolist())  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Where a grid lies: world = matrix · voxel + origin, everything in x, y, z order.
+
+    This is the one place where spacing enters: gradients are turned from per voxel to per world unit here.
+    Geometry is constant (plain float64 numbers), never a differentiable parameter.
+
+    Attributes:
+        matrix: 3 rows of the map from voxel steps to world steps; column d is the world step of one voxel along axis d.
+        origin: world position of the centre of voxel (0, 0, 0).
+    """
+
+    matrix: tuple[tuple[float, float, float], ...] = IDENTITY
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.matrix).all() or abs(np.linalg.det(self.matrix)) < 1e-300:
+            raise ValueError(f"the affine must be finite and invertible; got the 3×3 part {self.matrix}")
+
+    @classmethod
+    def of(
+        cls,
+        spacing: Sequence[float] | float | None = None,
+        origin: Sequence[float] | None = None,
+        affine: ArrayLike | Tensor | None = None,
+    ) -> Geometry:
+        """From spacing and origin (x, y, z), or from a 4×4 affine voxel → world (not both)."""
+        if affine is not None:
+            if spacing is not None or origin is not None:
+                raise ValueError("give spacing and origin, or an affine, not both")
+            a = np.asarray(affine, dtype=np.float64)
+            if a.shape != (4, 4) or not np.isfinite(a).all() or not np.allclose(a[3], (0, 0, 0, 1)):
+                raise ValueError(f"affine must be a finite 4×4 matrix with last row 0 0 0 1; got {a.tolist()}")
+            return cls(tuple(map(tuple, a[:3, :3].tolist())), tuple(a[:3, 3].tolist()))  # type: ignore[arg-type]
+        s = _triple("spacing", 1.0 if spacing is None else spacing)
+        if min(s) <= 0:
+            raise ValueError(f"spacing must be positive; got {s} (use an affine for flipped axes)")
+        return cls(
+            ((s[0], 0.0, 0.0), (0.0, s[1], 0.0), (0.0, 0.0, s[2])),
+            _triple("origin", (0.0, 0.0, 0.0) if origin is None else origin),
+        )
+
+    @property
+    def affine(self) -> np.ndarray:
+        """The 4×4 map from voxel (x, y, z, 1) to world, float64."""
+        a = np.eye(4)
+        a[:3, :3], a[:3, 3] = self.matrix, self.origin
+        return a
+
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """World length of one voxel step along x, y, z."""
+        return tuple(np.linalg.norm(np.asarray(self.matrix), axis=0).tolist())  # type: ignore[return-value]
+
+    @property
+    def is_identity(self) -> bool:
+        return self.matrix == IDENTITY and self.origin == (0.0, 0.0, 0.0)
+
+    @cached_property
+    def diagonal(self) -> tuple[float, float, float] | None:
+        """The signed steps along x, y, z when the axes are the world's, else None."""
+        m = np.asarray(self.matrix)
+        return tuple(np.diag(m).tolist()) if np.count_nonzero(m - np.diag(np.diag(m))) == 0 else None  # type: ignore[return-value]
+
+    @cached_property
+    def _inverse(self) -> np.ndarray:
+        return np.linalg.inv(np.asarray(self.matrix))
+
+    def _map_rows(self, rows: Tensor, matrix: np.ndarray) -> Tensor:
+        """rows · matrix; for world-aligned axes one product per component, so that nothing is mixed or rounded twice."""
+        if self.diagonal is not None:
+            return rows * torch.as_tensor(np.diag(matrix).copy(), dtype=rows.dtype, device=rows.device)
+        return rows @ torch.as_tensor(matrix.copy(), dtype=rows.dtype, device=rows.device)
+
+    def to_world(self, voxels: Tensor) -> Tensor:
+        """Voxel coordinates `(..., 3)` to world points."""
+        if self.is_identity:
+            return voxels
+        return self._map_rows(voxels, np.asarray(self.matrix).T) + voxels.new_tensor(self.origin)
+
+    def to_voxel(self, points: Tensor) -> Tensor:
+        """World points `(..., 3)` to voxel coordinates; the origin is subtracted before scaling."""
+        if self.is_identity:
+            return points
+        return self._map_rows(points - points.new_tensor(self.origin), self._inverse.T)
+
+    def direction_to_voxel(self, directions: Tensor) -> Tensor:
+        """World directions `(..., 3)` to voxel steps (no origin)."""
+        return directions if self.is_identity else self._map_rows(directions, self._inverse.T)
+
+    def gradient_to_world(self, gradient: Tensor) -> Tensor:
+        """Gradients `(..., 3)` per voxel to per world unit: g_world = matrix⁻ᵀ g_voxel."""
+        return gradient if self.is_identity else self._map_rows(gradient, self._inverse)
+
+    def hessian_to_world(self, hessian: Tensor) -> Tensor:
+        """Hessians `(..., 3, 3)` per voxel² to per world unit²: matrix⁻ᵀ H matrix⁻¹."""
+        return self.gradient_to_world(self.gradient_to_world(hessian).mT).mT
+
+
+class Volume:
+    """Samples of a scalar (or C-channel) quantity on a regular grid, with geometry.
+
+    Args:
+        samples: `(D, H, W)` or `(N, C, D, H, W)`; real, any integer or floating dtype. Kept as it is: neither copied,
+            converted nor moved; gradients flow back to it.
+        spacing: world length of a voxel along x, y, z; default 1.
+        origin: world position of the centre of voxel (0, 0, 0); default 0.
+        affine: instead of both, a 4×4 matrix from voxel (x, y, z, 1) to world.
+
+    Raises:
+        ValueError: wrong number of axes, an axis without voxels, non-positive spacing, singular affine.
+        TypeError: samples are no tensor, or complex or boolean.
+    """
+
+    def __init__(
+        self,
+        samples: Tensor,
+        spacing: Sequence[float] | float | None = None,
+        origin: Sequence[float] | None = None,
+        affine: ArrayLike | Tensor | None = None,
+    ) -> None:
+        self.samples = _checked_samples(samples)
+        self.geometry = Geometry.of(spacing, origin, affine)
+
+    @classmethod
+    def with_geometry(cls, samples: Tensor, geometry: Geometry) -> Volume:
+        """A volume on a known geometry."""
+        return cls(samples, affine=geometry.affine)
+
+    @property
+    def shape(self) -> torch.Size:
+        return self.samples.shape
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Voxels along x, y, z (the reverse of the last three axes of `shape`)."""
+        d, h, w = self.samples.shape[-3:]
+        return w, h, d
+
+    @property
+    def batched(self) -> bool:
+        """True for `(N, C, D, H, W)` samples."""
+        return self.samples.ndim == 5
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.samples.dtype
+
+    @property
+    def device(self) -> torch.device:
+        return self.samples.device
+
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        return self.geometry.spacing
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        return self.geometry.origin
+
+    @property
+    def affine(self) -> np.ndarray:
+        return self.geometry.affine
+
+    def to(self, *args, **kwargs) -> Volume:
+        """The same volume with `samples.to(...)`."""
+        return Volume.with_geometry(self.samples.to(*args, **kwargs), self.geometry)
+
+    def voxel_to_world(self, voxels: Tensor) -> Tensor:
+        return self.geometry.to_world(voxels)
+
+    def world_to_voxel(self, points: Tensor) -> Tensor:
+        return self.geometry.to_voxel(points)
+
+    def __repr__(self) -> str:
+        dtype = str(self.dtype).removeprefix("torch.")
+        spacing, origin = ([float(f"{v:.6g}") for v in t] for t in (self.spacing, self.origin))
+        return f"Volume(shape={tuple(self.shape)}, dtype={dtype}, spacing={spacing}, origin={origin})"
+
+
+def _checked_samples(samples: Tensor) -> Tensor:
+    if not isinstance(samples, Tensor):
+        raise TypeError(f"samples must be a torch.Tensor; got {type(samples).__name__}")
+    if samples.ndim not in (3, 5):
+        raise ValueError(f"samples must have shape (D, H, W) or (N, C, D, H, W); got {tuple(samples.shape)}")
+    if 0 in samples.shape[-3:]:
+        raise ValueError(f"every axis of a volume needs at least one voxel; got shape {tuple(samples.shape)}")
+    if samples.dtype.is_complex or samples.dtype == torch.bool:
+        raise TypeError(f"samples must be real numbers; got {samples.dtype}")
+    return samples
+
+
+def as_volume(volume: Volume | Tensor) -> Volume:
+    """A `Volume` as it is; a bare tensor with voxel centres at the integers."""
+    return volume if isinstance(volume, Volume) else Volume(volume)
+
+
+def from_grid_sample(points: Tensor, shape: Sequence[int], *, align_corners: bool) -> Tensor:
+    """`torch.nn.functional.grid_sample` coordinates in [−1, 1] (x, y, z) to voxel coordinates.
+
+    align_corners=True: x = (p+1)/2 · (n−1); False: x = ((p+1) · n − 1)/2. `shape` is (..., D, H, W).
+    """
+    n = points.new_tensor([int(k) for k in list(shape)[-3:]][::-1])
+    return (points + 1) / 2 * (n - 1) if align_corners else ((points + 1) * n - 1) / 2
+
+
+def from_zyx(points: Tensor) -> Tensor:
+    """Points in z, y, x order (as NumPy and scipy index arrays) to x, y, z order."""
+    return points.flip(-1)
