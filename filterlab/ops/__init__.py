@@ -1,0 +1,90 @@
+"""The numerical core: `jet` and its adjoint `splat`. Every evaluation in filterlab goes through these two.
+
+`jet` and `splat` here choose the implementation; `reference` is plain torch, `autograd` makes the pair differentiable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from filterlab.kernels import Kernel, PiecewisePolynomial
+from filterlab.ops import autograd, reference
+from filterlab.ops.reference import multi_indices
+
+__all__ = ["jet", "multi_indices", "splat"]
+
+
+def _per_axis(kernels: PiecewisePolynomial | Sequence[PiecewisePolynomial]) -> tuple[PiecewisePolynomial, ...]:
+    return (kernels,) * 3 if isinstance(kernels, PiecewisePolynomial) else tuple(kernels)
+
+
+def _check(
+    batch: Tensor, points: Tensor, kernels: Sequence[PiecewisePolynomial], order: int, shape: Sequence[int]
+) -> None:
+    if points.ndim != 3 or points.shape[-1] != 3 or not points.is_floating_point():
+        raise ValueError(f"points must be floating point of shape (N, M, 3); got {points.dtype} {tuple(points.shape)}")
+    if points.shape[0] != batch.shape[0]:
+        raise ValueError(f"batch sizes differ: {batch.shape[0]} of the first argument, {points.shape[0]} of points")
+    if order < 0:
+        raise ValueError(f"order must be ≥ 0; got {order}")
+    for axis, kernel, n in zip("xyz", kernels, tuple(shape)[::-1], strict=True):
+        if n < kernel.support:
+            raise ValueError(f"axis {axis} has {n} coefficients; the kernel {kernel.name} needs {kernel.support}")
+
+
+def jet(
+    coefficients: Tensor,
+    points: Tensor,
+    kernels: PiecewisePolynomial | Sequence[PiecewisePolynomial],
+    order: int = 0,
+) -> Tensor:
+    """All partial derivatives up to `order` of Σ_k c_k φ_x(x−k_x) φ_y(y−k_y) φ_z(z−k_z) at the points.
+
+    Args:
+        coefficients: (N, C, D, H, W), any real dtype, each axis at least as long as its kernel's support.
+        points: (N, M, 3), x, y, z in stored coordinates: coefficient 0 of an axis lies at 0. Points beyond the stored
+            coefficients are extrapolated from the outermost polynomial piece; nothing is read out of bounds.
+        kernels: one kernel, or one per axis x, y, z.
+        order: 0 value, 1 + gradient, 2 + Hessian, …; rows as in `multi_indices(order)`.
+
+    Returns:
+        (N, C, J, M) in the dtype of the points.
+
+    Differentiable any number of times in coefficients and points; in the tables of `TensorKernel`s too.
+    """
+    kernels = _per_axis(kernels)
+    if coefficients.ndim != 5:
+        raise ValueError(f"coefficients must have shape (N, C, D, H, W); got {tuple(coefficients.shape)}")
+    _check(coefficients, points, kernels, order, coefficients.shape[2:])
+    if all(isinstance(k, Kernel) for k in kernels):
+        return autograd.jet(coefficients, points, kernels, order)  # type: ignore[arg-type]
+    return reference.jet(coefficients, points, kernels, order)
+
+
+def splat(
+    cotangents: Tensor,
+    points: Tensor,
+    kernels: PiecewisePolynomial | Sequence[PiecewisePolynomial],
+    order: int,
+    shape: Sequence[int],
+) -> Tensor:
+    """The adjoint of `jet`: ⟨jet(c), g⟩ = ⟨c, splat(g)⟩.
+
+    Args:
+        cotangents: (N, C, J, M), as `jet` returns.
+        points, kernels, order: as for `jet`.
+        shape: (D, H, W) of the result.
+
+    Returns:
+        (N, C, D, H, W) in the dtype of the points. Differentiable any number of times in cotangents and points.
+    """
+    kernels = _per_axis(kernels)
+    rows = len(multi_indices(order))
+    if cotangents.ndim != 4 or cotangents.shape[2:] != (rows, points.shape[1]):
+        raise ValueError(f"cotangents must have shape (N, C, {rows}, M); got {tuple(cotangents.shape)}")
+    _check(cotangents, points, kernels, order, shape)
+    if all(isinstance(k, Kernel) for k in kernels):
+        return autograd.splat(cotangents, points, kernels, order, tuple(shape))  # type: ignore[arg-type]
+    return reference.splat(cotangents, points, kernels, order, shape)

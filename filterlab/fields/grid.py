@@ -1,0 +1,170 @@
+"""Fields on a grid: coefficients stored padded under the boundary, and the way from world points to them and back.
+
+Padding once means that no tap is ever folded: points are folded (or clamped) into the stored domain instead, the signs of
+gradients flipped where a reflection turned an axis round, and every boundary costs the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from filterlab.fields.base import Domain, Field, check_order, check_points
+from filterlab.kernels import Factor, PiecewisePolynomial
+from filterlab.ops import multi_indices
+from filterlab.prefilters import Prefilter, prefilter_axis
+from filterlab.volume import Boundary, Volume
+
+
+@dataclass(frozen=True)
+class Term:
+    """weight · Σ_k c_k φ_x(x−k_x) φ_y(y−k_y) φ_z(z−k_z): one separable term of a field's value."""
+
+    weight: float
+    kernels: tuple[PiecewisePolynomial, PiecewisePolynomial, PiecewisePolynomial]
+
+
+class Scheme(Protocol):
+    """How the sum over coefficients is computed.
+
+    Attributes:
+        name: `direct`, `eight_trilinear`, …
+        gradient: `analytic`, or `central` (differences of the trilinear interpolant).
+        max_order: the highest derivative it gives.
+        reach: coefficients needed on each side of a point's cell.
+        terms: the value as a sum of separable terms (what `resample` uses).
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def gradient(self) -> str: ...
+    @property
+    def max_order(self) -> int: ...
+    @property
+    def reach(self) -> int: ...
+    @property
+    def terms(self) -> tuple[Term, ...]: ...
+
+    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+        """(N, C, D, H, W), stored points (N, M, 3) -> (N, C, J, M), rows as in `multi_indices(order)`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """Coefficients padded under a boundary.
+
+    Attributes:
+        values: (N, C, D', H', W').
+        start: voxel coordinate of the first stored coefficient, the same on every axis (half-integer for the notch).
+        size: voxels of the volume along x, y, z.
+        boundary: the extension of the samples.
+        tail: how far beyond the ends points are told apart (border and zeros); the extension is constant beyond.
+    """
+
+    values: Tensor
+    start: float
+    size: tuple[int, int, int]
+    boundary: Boundary
+    tail: int
+
+    @classmethod
+    def of(
+        cls, samples: Tensor, prefilter: Prefilter, boundary: Boundary, reach: int, factor: Factor | None = None
+    ) -> Coefficients:
+        """Prefilter, extend by the boundary, and apply the discrete part of a factored kernel.
+
+        Memory: (n + 2·pad)³ coefficients, pad = reach (+1 for a factored kernel) under mirror, reflect and wrap;
+        under border and zeros 2·reach plus the prefilter's decay (about 10 … 50 voxels, see `Prefilter.decay`).
+        """
+        values = samples if prefilter.is_identity else samples.to(torch.promote_types(samples.dtype, torch.float32))
+        reach = reach if factor is None else reach + 1
+        decay = 0 if boundary.periodic else prefilter.decay(values.dtype)
+        tail = 0 if boundary.periodic else decay + reach
+        pad = reach + tail - decay
+        for dim in (-3, -2, -1):
+            if not prefilter.is_identity:
+                values = prefilter_axis(values, dim, prefilter, boundary, decay)
+            values = boundary.extend(values, dim, pad, pad)
+        start = -float(pad + decay)
+        if factor is not None:
+            values, start = _apply_factor(values, factor), start + 0.5
+        d, h, w = samples.shape[-3:]
+        return cls(values, start, (w, h, d), boundary, tail)
+
+    def locate(self, voxels: Tensor) -> tuple[Tensor, Tensor]:
+        """Voxel coordinates (..., 3) to stored coordinates, and the sign ±1 or 0 of each axis."""
+        axes = [self.boundary.fold(x, n, self.tail) for x, n in zip(voxels.unbind(-1), self.size, strict=True)]
+        folded = torch.stack([x for x, _ in axes], -1)
+        return folded - self.start, torch.stack([s for _, s in axes], -1)
+
+
+def _apply_factor(values: Tensor, factor: Factor) -> Tensor:
+    """Averages of neighbours along every axis: the coefficients at half-integers, one fewer per axis."""
+    assert [float(o) for o in factor.offsets] == [0.5, -0.5], "only half-shifted pairs are factored"
+    first, second = (float(w) for w in factor.weights)
+    values = values.to(torch.promote_types(values.dtype, torch.float32))
+    for dim in (-3, -2, -1):
+        n = values.shape[dim] - 1
+        values = first * values.narrow(dim, 0, n) + second * values.narrow(dim, 1, n)
+    return values
+
+
+class GridField(Field):
+    """A field given by coefficients on a grid and a scheme that sums them.
+
+    Attributes:
+        method: name of the method that built it.
+        scheme: how it is evaluated; `field.scheme.name` says which.
+        coefficients: the padded coefficients.
+    """
+
+    def __init__(self, method: str, volume: Volume, coefficients: Coefficients, scheme: Scheme) -> None:
+        self.method = method
+        self.scheme = scheme
+        self.coefficients = coefficients
+        self.domain = Domain.of_grid(volume.size, volume.geometry)
+        self.max_order = scheme.max_order
+        self.channels = (volume.shape[0], volume.shape[1]) if volume.batched else None
+
+    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+        check_order(order, self.max_order)
+        points = check_points(points, self.channels)
+        batched = points if self.channels is not None else points[None]
+        stored, sign = self.coefficients.locate(self.domain.geometry.to_voxel(batched.flatten(1, -2)))
+        rows = self._rows(stored, order)  # (N, C, J, M)
+        shape = batched.shape[1:-1]
+        out = [self._shaped(rows[:, :, 0], shape)]
+        if order >= 1:
+            gradient = rows[:, :, 1:4].movedim(2, -1) * sign[:, None]
+            out.append(self._shaped(self.domain.geometry.gradient_to_world(gradient), shape))
+        if order >= 2:
+            hessian = _symmetric(rows[:, :, 4:10]) * (sign[..., :, None] * sign[..., None, :])[:, None]
+            out.append(self._shaped(self.domain.geometry.hessian_to_world(hessian), shape))
+        return tuple(out)
+
+    def _rows(self, stored: Tensor, order: int) -> Tensor:
+        """The scheme's jet; one set of points for a whole batch is evaluated once, with the batch as channels."""
+        values = self.coefficients.values if self.channels is not None else self.coefficients.values[None, None]
+        n, c = values.shape[:2]
+        if stored.shape[0] == n:
+            return self.scheme.jet(values, stored, order)
+        return self.scheme.jet(values.reshape(1, n * c, *values.shape[2:]), stored, order).reshape(
+            n, c, len(multi_indices(order)), -1
+        )
+
+    def _shaped(self, x: Tensor, shape: Sequence[int]) -> Tensor:
+        """(N, C, M, ...) to (N, C, *P, ...), or (*P, ...) for an unbatched field."""
+        x = x.reshape(*x.shape[:2], *shape, *x.shape[3:])
+        return x if self.channels is not None else x[0, 0]
+
+
+def _symmetric(rows: Tensor) -> Tensor:
+    """(N, C, 6, M) of xx, xy, xz, yy, yz, zz to (N, C, M, 3, 3)."""
+    xx, xy, xz, yy, yz, zz = rows.unbind(2)
+    return torch.stack([torch.stack(r, -1) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], -2)

@@ -1,0 +1,220 @@
+"""Schemes for separable kernels: the direct sum over taps, and linear combinations of trilinear samples.
+
+`direct` sums S³ taps. `eight_trilinear` is what a texture unit wants: eight trilinear samples for a triquadratic value
+*and* its gradient (the paper's contribution), 8 + 24 for a tricubic one (Sigg & Hadwiger). On a CPU it is slower than the
+direct sum. The trilinear sample itself is pluggable; one sampler models the 8-bit fractions of a texture unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from filterlab import ops
+from filterlab.fields.grid import Term
+from filterlab.kernels import CENTRAL_DIFFERENCE, LINEAR, PiecewisePolynomial, bspline, horner
+
+Sampler = Callable[[Tensor, Tensor], Tensor]
+"""(coefficients (N, C, D, H, W), stored points (N, M, 3)) -> trilinear samples (N, C, M)."""
+
+
+def exact_sample(coefficients: Tensor, points: Tensor) -> Tensor:
+    """Trilinear interpolation in the dtype of the points."""
+    return ops.jet(coefficients, points, LINEAR, 0)[:, :, 0]
+
+
+def texture_unit_sample(coefficients: Tensor, points: Tensor) -> Tensor:
+    """Trilinear interpolation as a texture unit computes it: each fraction α rounded to the nearest 1/256.
+
+    GPUs filter with 9-bit fixed-point weights, 8 of them fractional (CUDA C++ Programming Guide, "Linear filtering").
+    The rounding is invisible to derivatives (straight-through), so that gradients are those of the unrounded sample.
+    """
+    cell = points.floor()
+    rounded = cell + torch.round((points - cell) * 256) / 256
+    return exact_sample(coefficients, points + (rounded - points).detach())
+
+
+SAMPLERS: dict[str, Sampler] = {"exact": exact_sample, "texture_unit": texture_unit_sample}
+
+
+def named_sampler(sampler: str | Sampler) -> Sampler:
+    """The sampler of that name, or the callable itself. Raises ValueError that lists the known names."""
+    if callable(sampler):
+        return sampler
+    if sampler not in SAMPLERS:
+        raise ValueError(f"sampler must be one of {', '.join(SAMPLERS)} or a callable; got {sampler!r}")
+    return SAMPLERS[sampler]
+
+
+def reach_of(terms: tuple[Term, ...]) -> int:
+    """Coefficients that the widest kernel needs on each side of a point's cell."""
+    return max(k.support for term in terms for k in term.kernels) // 2 + 1
+
+
+def same_kernel(kernel: PiecewisePolynomial) -> tuple[Term, ...]:
+    """One term with the same kernel along x, y and z."""
+    return (Term(1.0, (kernel, kernel, kernel)),)
+
+
+def along(axis: int, kernel: PiecewisePolynomial, others: PiecewisePolynomial = LINEAR) -> Term:
+    """`kernel` along one axis (0 = x), `others` along the other two."""
+    kernels = [others] * 3
+    kernels[axis] = kernel
+    return Term(1.0, (kernels[0], kernels[1], kernels[2]))
+
+
+CENTRAL_TERMS = tuple(along(axis, CENTRAL_DIFFERENCE) for axis in range(3))
+"""∂f/∂x_d ≈ (T(x + e_d) − T(x − e_d)) / 2 with T the trilinear interpolant: each is a separable sum itself."""
+
+
+@dataclass(frozen=True)
+class Direct:
+    """The sum over taps, Σ_terms weight · Σ_k c_k φ_x φ_y φ_z, with analytic derivatives up to the Hessian."""
+
+    terms: tuple[Term, ...]
+    name: str = "direct"
+    gradient: str = "analytic"
+    max_order: int = 2
+
+    @property
+    def reach(self) -> int:
+        return reach_of(self.terms)
+
+    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+        parts = [ops.jet(coefficients, points, term.kernels, order) for term in self.terms]
+        if len(parts) == 1 and self.terms[0].weight == 1:
+            return parts[0]
+        return sum((t.weight * p for t, p in zip(self.terms[1:], parts[1:], strict=True)), self.terms[0].weight * parts[0])
+
+
+@dataclass(frozen=True)
+class DirectCentral:
+    """Value by the direct sum, gradient by central differences of the trilinear interpolant, as sums over taps."""
+
+    terms: tuple[Term, ...]
+    name: str = "direct"
+    gradient: str = "central"
+    max_order: int = 1
+
+    @property
+    def reach(self) -> int:
+        return reach_of((*self.terms, *CENTRAL_TERMS))
+
+    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+        value = Direct(self.terms).jet(coefficients, points, 0)
+        if order == 0:
+            return value
+        differences = [ops.jet(coefficients, points, term.kernels, 0) for term in CENTRAL_TERMS]
+        return torch.cat([value, *differences], 2)
+
+
+@dataclass(frozen=True)
+class EightTrilinearQuadratic:
+    """Triquadratic value and gradient from the same eight trilinear samples (paper, eqs. 7, 24, 25).
+
+    With β = x − ⌊x + ½⌋ per axis: samples at x − δ₀ and x + δ₁, δ₀ = ¼ + β/2, δ₁ = ¼ − β/2, weighted by g₀ = ½ − β and
+    g₁ = ½ + β for the value, by −2 and 2 for the derivative along that axis.
+    """
+
+    sample: Sampler
+    terms: tuple[Term, ...] = field(default_factory=lambda: same_kernel(bspline(2)))
+    name: str = "eight_trilinear"
+    gradient: str = "analytic"
+    max_order: int = 1
+    reach: int = 2
+
+    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+        beta = points - (points + 0.5).floor()
+        ends = (points - (0.25 + 0.5 * beta), points + (0.25 - 0.5 * beta))
+        samples = _at_corners(self.sample, coefficients, ends, ends, ends)
+        weights = torch.stack((0.5 - beta, 0.5 + beta))  # (2, N, M, 3)
+        difference = points.new_tensor([-2.0, 2.0])[:, None, None, None].expand_as(weights)
+        rows = [[weights] * 3]
+        if order:
+            rows += [[difference if a == axis else weights for a in range(3)] for axis in range(3)]
+        return torch.stack([_combine(samples, row) for row in rows], 2)
+
+
+@dataclass(frozen=True)
+class EightTrilinearCubic:
+    """Tricubic B-spline value from 8 trilinear samples, each partial derivative from 8 more (paper, eqs. 1-3).
+
+    Per axis, with α the fractional part and w_t the four weights (or their derivatives): samples at
+    i − 1 + w₁/g₀ and i + 1 + w₃/g₁ with g₀ = w₀ + w₁, g₁ = w₂ + w₃. Source: Sigg & Hadwiger, GPU Gems 2, chapter 20.
+    """
+
+    sample: Sampler
+    terms: tuple[Term, ...] = field(default_factory=lambda: same_kernel(bspline(3)))
+    name: str = "eight_trilinear"
+    gradient: str = "analytic"
+    max_order: int = 1
+    reach: int = 3
+
+    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+        cell = points.floor()
+        pairs = [_paired(cell, points - cell, derivative) for derivative in range(order + 1)]
+        choices = [(0, 0, 0)] + ([(1, 0, 0), (0, 1, 0), (0, 0, 1)] if order else [])
+        rows = []
+        for choice in choices:
+            ends = [pairs[c][0] for c in choice]
+            rows.append(_combine(_at_corners(self.sample, coefficients, *ends), [pairs[c][1] for c in choice]))
+        return torch.stack(rows, 2)
+
+
+def _paired(cell: Tensor, alpha: Tensor, derivative: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
+    """Positions of the two linear samples that replace four taps, and their weights (2, N, M, 3)."""
+    kernel = bspline(3).derivative(derivative)
+    w = [horner(row.unbind(0), alpha) for row in kernel.taps(alpha.dtype, alpha.device)]
+    g0, g1 = w[0] + w[1], w[2] + w[3]
+    return (cell - 1 + w[1] / g0, cell + 1 + w[3] / g1), torch.stack((g0, g1))
+
+
+def _at_corners(
+    sample: Sampler,
+    coefficients: Tensor,
+    x: tuple[Tensor, Tensor],
+    y: tuple[Tensor, Tensor],
+    z: tuple[Tensor, Tensor],
+) -> list[Tensor]:
+    """The eight samples at all combinations of two positions per axis; x varies fastest. Each pair holds (N, M, 3)."""
+    return [
+        sample(coefficients, torch.stack((x[i][..., 0], y[j][..., 1], z[k][..., 2]), -1))
+        for k, j, i in product(range(2), repeat=3)
+    ]
+
+
+def _combine(samples: list[Tensor], weights: list[Tensor]) -> Tensor:
+    """Σ over the eight corners, along x, then y, then z; weights[axis] is (2, N, M, 3)."""
+    for axis in range(3):
+        low, high = (w[..., axis][:, None] for w in weights[axis])  # (N, 1, M): over channels
+        samples = [torch.addcmul(low * a, high, b) for a, b in zip(samples[::2], samples[1::2], strict=True)]
+    return samples[0]
+
+
+@dataclass(frozen=True)
+class TrilinearCentral:
+    """One trilinear sample for the value, six more for central differences: what volume renderers do by default."""
+
+    sample: Sampler
+    terms: tuple[Term, ...] = field(default_factory=lambda: same_kernel(LINEAR))
+    name: str = "eight_trilinear"
+    gradient: str = "central"
+    max_order: int = 1
+    reach: int = 3
+
+    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+        value = self.sample(coefficients, points)
+        if order == 0:
+            return value[:, :, None]
+        ahead, behind = unit_steps(self.sample, coefficients, points)
+        return torch.stack([value, *((a - b) / 2 for a, b in zip(ahead, behind, strict=True))], 2)
+
+
+def unit_steps(sample: Sampler, coefficients: Tensor, points: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+    """Trilinear samples one voxel ahead and one behind along x, y and z."""
+    steps = torch.eye(3, dtype=points.dtype, device=points.device)
+    return [sample(coefficients, points + s) for s in steps], [sample(coefficients, points - s) for s in steps]

@@ -1,0 +1,272 @@
+"""Methods: named recipes that turn a Volume into a Field. A method is data: a kernel, a prefilter, schemes, facts.
+
+To add one, add an entry to `METHODS`; the tests, the experiments and the command line read it from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+from torch import Tensor
+
+from filterlab import kernels, prefilters
+from filterlab.fields.base import Field
+from filterlab.fields.grid import Coefficients, GridField, Scheme, Term
+from filterlab.fields.ncrsi import NCRSI_TERMS, SevenSamples
+from filterlab.fields.tensor_product import (
+    Direct,
+    DirectCentral,
+    EightTrilinearCubic,
+    EightTrilinearQuadratic,
+    Sampler,
+    TrilinearCentral,
+    named_sampler,
+    same_kernel,
+)
+from filterlab.kernels import Kernel, PiecewisePolynomial
+from filterlab.prefilters import Prefilter
+from filterlab.volume import Boundary, Volume, as_volume
+
+SampledScheme = Callable[[Sampler], Scheme]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a method promises; each is measured by a test.
+
+    Attributes:
+        support: width of the kernel along an axis, in voxels.
+        taps: coefficients that one value needs (after the notch's averaging: 27).
+        approximation_order: L, the error falls as h^L; with the method's own prefilter.
+        approximation_order_without_prefilter: the same without it.
+        continuity: m, the field is C^m (−1: discontinuous).
+        interpolating: the field returns every sample; with the method's own prefilter.
+        interpolating_without_prefilter: the same without it.
+        prefiltered: the method has a prefilter.
+        gradients: the kinds offered, the default first; `analytic` or `central` (differences of the trilinear samples).
+        schemes: the ways of evaluating it.
+    """
+
+    support: int
+    taps: int
+    approximation_order: int
+    approximation_order_without_prefilter: int
+    continuity: int
+    interpolating: bool
+    interpolating_without_prefilter: bool
+    prefiltered: bool
+    gradients: tuple[str, ...]
+    schemes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Method:
+    """Prefilter + kernel + ways to evaluate the sum.
+
+    Attributes:
+        name: as in the registry.
+        summary: one line for people.
+        kernel: φ. For ncrsi, whose 3-D kernel is not separable, the 1-D kernel on grid lines.
+        prefilter: samples to coefficients.
+        gradients: kinds of gradient offered, the default first.
+        sampled: the evaluation by trilinear samples, where there is one.
+        sampled_gradient: the kind of gradient it gives.
+        terms: the value as separable terms, when it is not one kernel along every axis.
+        continuity: of the field, when it is not the kernel's.
+        taps: coefficients one value needs, when it is not the evaluated kernel's support cubed.
+    """
+
+    name: str
+    summary: str
+    kernel: PiecewisePolynomial
+    prefilter: Prefilter = prefilters.IDENTITY
+    gradients: tuple[str, ...] = ("analytic",)
+    sampled: SampledScheme | None = None
+    sampled_gradient: str = "analytic"
+    terms: tuple[Term, ...] | None = None
+    continuity: int | None = None
+    taps: int | None = None
+
+    @property
+    def factor(self) -> kernels.Factor | None:
+        return self.kernel.factor if isinstance(self.kernel, Kernel) else None
+
+    @property
+    def value_terms(self) -> tuple[Term, ...]:
+        """The value as separable terms over the stored coefficients."""
+        return self.terms or same_kernel(self.factor.kernel if self.factor else self.kernel)
+
+    @cached_property
+    def facts(self) -> Facts:
+        """What the method promises. Raises TypeError for a kernel given as a tensor: it promises nothing."""
+        if not isinstance(self.kernel, Kernel):
+            raise TypeError(f"facts come from an exact kernel; {self.kernel.name} is a {type(self.kernel).__name__}")
+        evaluated = self.factor.kernel.support if self.factor else self.kernel.support
+        quasi_interpolates = self.kernel.direct_order == self.kernel.approximation_order or not self.prefilter.is_identity
+        interpolates = self.prefilter.factors == prefilters.interpolation(self.kernel).factors if _invertible(
+            self.kernel
+        ) else False
+        return Facts(
+            support=self.kernel.support,
+            taps=self.taps or evaluated**3,
+            approximation_order=self.kernel.approximation_order if quasi_interpolates else self.kernel.direct_order,
+            approximation_order_without_prefilter=self.kernel.direct_order,
+            continuity=self.kernel.continuity if self.continuity is None else self.continuity,
+            interpolating=interpolates,
+            interpolating_without_prefilter=self.kernel.interpolating,
+            prefiltered=not self.prefilter.is_identity,
+            gradients=self.gradients,
+            schemes=("direct",) if self.sampled is None else ("direct", "eight_trilinear"),
+        )
+
+    def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> Scheme:
+        """The scheme of that name with that kind of gradient (None: the default of either).
+
+        Raises ValueError for a name or a combination that the method does not offer, with those it does.
+        """
+        offered = ("direct",) if self.sampled is None else ("direct", "eight_trilinear")
+        if name not in (None, *offered):
+            raise ValueError(f"method {self.name} offers the schemes {', '.join(offered)}; got {name!r}")
+        if gradient not in (None, *self.gradients):
+            raise ValueError(f"method {self.name} offers the gradients {', '.join(self.gradients)}; got {gradient!r}")
+        if name == "eight_trilinear":
+            if gradient not in (None, self.sampled_gradient):
+                raise ValueError(
+                    f"eight_trilinear gives {self.name} the {self.sampled_gradient} gradient; "
+                    f"use scheme='direct' for gradient={gradient!r}"
+                )
+            assert self.sampled is not None
+            return self.sampled(named_sampler(sampler))
+        if sampler != "exact":
+            raise ValueError(f"sampler={sampler!r} needs scheme='eight_trilinear'; the direct sum takes no samples")
+        analytic = (gradient or self.gradients[0]) == "analytic"
+        return Direct(self.value_terms) if analytic else DirectCentral(self.value_terms)
+
+
+def _invertible(kernel: Kernel) -> bool:
+    """Whether a prefilter exists with which the kernel interpolates (the notch has none)."""
+    try:
+        return prefilters.interpolation(kernel).poles is not None
+    except ValueError:
+        return False
+
+
+METHODS: dict[str, Method] = {
+    m.name: m
+    for m in (
+        Method(
+            "trilinear",
+            "linear interpolation along each axis: the de facto standard",
+            kernels.LINEAR,
+            gradients=("analytic", "central"),
+            sampled=TrilinearCentral,
+            sampled_gradient="central",
+        ),
+        Method("catmull-rom", "interpolating cubic spline along each axis", kernels.CATMULL_ROM),
+        Method(
+            "ncrsi",
+            "nonseparable Catmull-Rom: trilinear samples and central differences, order three for free",
+            kernels.CATMULL_ROM,
+            gradients=("central", "analytic"),
+            sampled=SevenSamples,
+            sampled_gradient="central",
+            terms=NCRSI_TERMS,
+            continuity=0,
+            taps=32,
+        ),
+        Method(
+            "triquadratic",
+            "prefiltered quadratic B-spline: C1, analytic gradient from the same eight samples",
+            kernels.bspline(2),
+            prefilters.QUADRATIC,
+            sampled=EightTrilinearQuadratic,
+        ),
+        Method(
+            "notch",
+            "prefiltered Mitchell-Netravali notch: least staircase aliasing",
+            kernels.NOTCH,
+            prefilters.NOTCH,
+            sampled=EightTrilinearQuadratic,
+        ),
+        Method("mitchell", "Mitchell-Netravali (1/3, 1/3): a compromise of blur and ringing", kernels.MITCHELL),
+        Method(
+            "tricubic",
+            "prefiltered cubic B-spline: C2, order four",
+            kernels.bspline(3),
+            prefilters.CUBIC,
+            sampled=EightTrilinearCubic,
+        ),
+    )
+}
+
+
+def named(name: str, methods: Mapping[str, Method] = METHODS) -> Method:
+    """The method of that name. Raises ValueError that lists the known names."""
+    if name not in methods:
+        raise ValueError(f"unknown method {name!r}; known methods: {', '.join(methods)}")
+    return methods[name]
+
+
+def from_kernel(kernel: PiecewisePolynomial, prefilter: Prefilter | None = None) -> Method:
+    """A method made of any kernel.
+
+    Args:
+        kernel: a `Kernel` or a `TensorKernel` (then the field is differentiable in its table).
+        prefilter: default: the one with which an exact kernel interpolates; none for a `TensorKernel`.
+    """
+    if prefilter is None:
+        prefilter = prefilters.interpolation(kernel) if isinstance(kernel, Kernel) else prefilters.IDENTITY
+    return Method(kernel.name, "made from a kernel", kernel, prefilter)
+
+
+def as_method(method: str | Method | PiecewisePolynomial) -> Method:
+    """A method by name, as it is, or made from a kernel."""
+    if isinstance(method, str):
+        return named(method)
+    if isinstance(method, PiecewisePolynomial):
+        return from_kernel(method)
+    if not isinstance(method, Method):
+        raise TypeError(f"method must be a name, a Method or a kernel; got {type(method).__name__}")
+    return method
+
+
+def reconstruct(
+    volume: Volume | Tensor,
+    method: str | Method | PiecewisePolynomial = "triquadratic",
+    *,
+    boundary: str | Boundary = Boundary.MIRROR,
+    prefilter: bool = True,
+    scheme: str | None = None,
+    gradient: str | None = None,
+    sampler: str | Sampler = "exact",
+) -> Field:
+    """A continuous, differentiable field from a sampled volume: f(x) = Σ_k c_k φ(x − k), c = prefilter(samples).
+
+    Args:
+        volume: a `Volume`, or a bare tensor (D, H, W) or (N, C, D, H, W) whose voxel centres are the integers.
+        method: a name from `METHODS`, a `Method`, or a kernel.
+        boundary: how the samples go on beyond the ends: mirror, reflect, wrap, border or zeros.
+        prefilter: False to sum the samples themselves (blurs with a kernel that does not interpolate).
+        scheme: `direct` (default) or, where the method offers it, `eight_trilinear`.
+        gradient: `analytic` or `central`, where the method offers both; default: the method's own.
+        sampler: for `eight_trilinear`: `exact`, `texture_unit` (8-bit fractions) or a callable.
+
+    Returns:
+        a Field. It is differentiable in the volume's samples (any floating dtype), in points, and in the table of a
+        `TensorKernel`. Prefiltered coefficients are stored as promote(samples, float32), others as the samples are.
+
+    Raises:
+        ValueError: unknown name, or a combination that the method does not offer.
+    """
+    volume, method, boundary = as_volume(volume), as_method(method), Boundary.named(boundary)
+    chosen = method.scheme(scheme, gradient, sampler)
+    coefficients = Coefficients.of(
+        volume.samples,
+        method.prefilter if prefilter else prefilters.IDENTITY,
+        boundary,
+        chosen.reach,
+        method.factor,
+    )
+    return GridField(method.name, volume, coefficients, chosen)

@@ -1,0 +1,174 @@
+"""Prefilters: from samples to the coefficients that a kernel is summed with.
+
+A prefilter undoes discrete symmetric filters q: c = q⁻¹ ∗ f, P(ω) = Π 1 / q̂(ω). Written with its poles z (|z| < 1) the
+inverse of one factor is the symmetric two-sided exponential
+
+    c_k = gain · Σ_j z^|k−j| f_j,        gain = (1 − z)²  per pole,  after which a constant stays what it was,
+
+computed as one causal and one anticausal first-order recursion: O(n) per line.
+
+The boundary has no code here. A line is first extended by the boundary's own rule, far enough that what lies beyond
+(|z|^length below rounding) does not matter; then the recursions start from zero. So every boundary is exact, at both
+ends, for axes of 1, 2, 3, … voxels. Under mirror, reflect and wrap the coefficients extend as the samples do. Under border
+and zeros they do not: they have a tail that decays like |z|^k outside, which is kept (`tail` of `prefilter_axis`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from filterlab.kernels import Kernel, bspline
+from filterlab.volume import Boundary
+
+
+@dataclass(frozen=True)
+class Prefilter:
+    """The inverse of a cascade of symmetric discrete filters.
+
+    Attributes:
+        name: as in the registry.
+        factors: each factor (q₀, q₁, …) stands for q̂(ω) = q₀ + 2 Σ_k q_k cos(kω); q̂(0) = 1. None: the identity.
+    """
+
+    name: str
+    factors: tuple[tuple[Fraction, ...], ...] = ()
+
+    @cached_property
+    def poles(self) -> tuple[float, ...]:
+        """The poles inside the unit circle, with multiplicity, factor by factor."""
+        return tuple(z for factor in self.factors for z in _poles_inside(factor))
+
+    @property
+    def is_identity(self) -> bool:
+        return not self.factors
+
+    def response(self, omega: Tensor) -> Tensor:
+        """P(ω) = Π 1 / q̂(ω); ω in radians per voxel."""
+        out = torch.ones_like(omega)
+        for factor in self.factors:
+            q = torch.full_like(omega, float(factor[0]))
+            for k, c in enumerate(factor[1:], start=1):
+                q = q + 2 * float(c) * torch.cos(k * omega)
+            out = out / q
+        return out
+
+    def decay(self, dtype: torch.dtype) -> int:
+        """Voxels after which the influence of a sample has fallen below the rounding of `dtype`."""
+        if self.is_identity:
+            return 0
+        slowest = max(abs(z) for z in self.poles)
+        return math.ceil(math.log(torch.finfo(dtype).eps / 16) / math.log(slowest)) + 2 * len(self.poles)
+
+
+def _poles_inside(factor: tuple[Fraction, ...]) -> list[float]:
+    """The roots inside the unit circle of q₀ + Σ q_k (z^k + z^−k), all real for B-splines; polished by Newton's method.
+
+    Raises ValueError when a root lies on the circle: then q̂ vanishes somewhere and cannot be inverted.
+    """
+    p = np.array([float(c) for c in (*factor[:0:-1], *factor)])
+    roots = np.roots(p)
+    if np.any(np.abs(np.abs(roots) - 1) < 1e-6) or np.any(np.abs(roots.imag) > 1e-9):
+        raise ValueError(f"the discrete filter {[str(c) for c in factor]} has a zero in its response: no inverse exists")
+    slope = np.polyder(p)
+    inside = []
+    for z in sorted(r.real for r in roots if abs(r) < 1):
+        for _ in range(3):
+            z -= np.polyval(p, z) / np.polyval(slope, z)
+        inside.append(float(z))
+    return inside
+
+
+def interpolation(kernel: Kernel) -> Prefilter:
+    """The prefilter with which a kernel interpolates: the inverse of its integer samples (paper, eqs. 16-19)."""
+    if kernel.interpolating:
+        return IDENTITY
+    samples = kernel.integer_samples()
+    taps = tuple(samples[k] for k in range(max(samples) + 1) if samples[k])
+    return Prefilter(f"{kernel.name}-interpolation", (taps,))
+
+
+IDENTITY = Prefilter("identity")
+QUADRATIC = Prefilter("quadratic", interpolation(bspline(2)).factors)
+CUBIC = Prefilter("cubic", interpolation(bspline(3)).factors)
+QUARTIC = Prefilter("quartic", interpolation(bspline(4)).factors)
+QUINTIC = Prefilter("quintic", interpolation(bspline(5)).factors)
+# paper, section 3.3: q_notch = q_quad ∗ q_quad; quasi-interpolation of order three
+NOTCH = Prefilter("notch", QUADRATIC.factors * 2)
+
+PREFILTERS: dict[str, Prefilter] = {p.name: p for p in (IDENTITY, QUADRATIC, CUBIC, QUARTIC, QUINTIC, NOTCH)}
+
+
+class _TwoSidedExponential(torch.autograd.Function):
+    """y_k = gain · Σ_j z^|k−j| x_j along axis 0 (zero beyond the ends): a symmetric operator, so it is its own adjoint."""
+
+    @staticmethod
+    def forward(x: Tensor, pole: float) -> Tensor:
+        y = x * (1 - pole) ** 2
+        rows = y.unbind(0)
+        for previous, row in zip(rows[:-1], rows[1:], strict=True):
+            row.add_(previous, alpha=pole)
+        for following, row in zip(rows[:0:-1], rows[-2::-1], strict=True):
+            row.add_(following, alpha=pole)
+        return y
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.pole = inputs[1]
+
+    @staticmethod
+    def backward(ctx, *gradients: Tensor):
+        return _two_sided_exponential(gradients[0], ctx.pole), None
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        return _two_sided_exponential(tangents[0], ctx.pole)
+
+    @staticmethod
+    def vmap(info, in_dims, x: Tensor, pole: float):
+        return _two_sided_exponential(x.movedim(in_dims[0], -1), pole), x.ndim - 1
+
+
+def _two_sided_exponential(x: Tensor, pole: float) -> Tensor:
+    return _TwoSidedExponential.apply(x, pole)  # type: ignore[return-value]
+
+
+def prefilter_axis(
+    samples: Tensor, dim: int, prefilter: Prefilter, boundary: str | Boundary = Boundary.MIRROR, tail: int = 0
+) -> Tensor:
+    """Coefficients along one axis.
+
+    Args:
+        samples: any shape, floating point.
+        dim: the axis to filter.
+        tail: coefficients to return beyond each end (border and zeros need them; see the head of this file).
+
+    Returns:
+        the coefficients, `samples.shape` with n + 2·tail along `dim`. Linear in, and exactly differentiable by, samples.
+    """
+    boundary = Boundary.named(boundary)
+    warm_up = prefilter.decay(samples.dtype)
+    lines = boundary.extend(samples, dim, tail + warm_up, tail + warm_up).movedim(dim, 0).contiguous()
+    for pole in prefilter.poles:
+        lines = _two_sided_exponential(lines, pole)
+    return lines[warm_up : lines.shape[0] - warm_up].movedim(0, dim)
+
+
+def prefilter_samples(samples: Tensor, prefilter: Prefilter, boundary: str | Boundary = Boundary.MIRROR) -> Tensor:
+    """Coefficients of a whole volume `(..., D, H, W)`: `prefilter_axis` along x, y and z, same shape and dtype.
+
+    Under border and zeros these are the coefficients inside the volume only; `reconstruct` keeps the tails as well.
+    Integer, float16 and bfloat16 samples are filtered in float32. Differentiable in the samples.
+    """
+    if samples.ndim < 3:
+        raise ValueError(f"samples must have shape (..., D, H, W); got {tuple(samples.shape)}")
+    out = samples.to(torch.promote_types(samples.dtype, torch.float32))
+    for dim in (-3, -2, -1):
+        out = prefilter_axis(out, dim, prefilter, boundary)
+    return out
