@@ -1,8 +1,8 @@
 """1-D reconstruction kernels as exact rational piecewise polynomials.
 
-A kernel φ of support S is zero outside [−S/2, S/2] and a polynomial on each of the S unit intervals between. It is given
-by its table alone: `pieces[i][j]` is the coefficient of u^j on the interval i, x = −S/2 + i + u, u ∈ [0, 1). Everything
-else (derivatives, integer samples, moments, Fourier transform, order, continuity, …) is derived from the table.
+A kernel φ of support S is zero outside [−S/2, S/2] and a polynomial on each of the S unit intervals between. It is
+given by its table alone: `pieces[i][j]` is the coefficient of u^j on the interval i, x = −S/2 + i + u, u ∈ [0, 1).
+Everything else (derivatives, integer samples, moments, Fourier transform, order, continuity, …) is derived from it.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ class Kernel(PiecewisePolynomial):
         pieces = self.pieces
         for _ in range(times):
             pieces = tuple(_derivative(p) for p in pieces)
-        return Kernel(f"{self.name}{chr(39) * times}", _trimmed(pieces))
+        return Kernel(self.name + "'" * times, _trimmed(pieces))
 
     def integer_samples(self) -> dict[int, Fraction]:
         """φ(k) for every integer k inside the support: the discrete filter q that interpolation has to invert."""
@@ -305,7 +305,9 @@ def _trimmed(pieces: Sequence[Sequence[Fraction]]) -> Pieces:
 
 @lru_cache
 def bspline(degree: int) -> Kernel:
-    """The centred B-spline of a degree: β⁰ is the box, β^d(x) = (((d+1)/2 + x) β^{d−1}(x+½) + ((d+1)/2 − x) β^{d−1}(x−½)) / d.
+    """The centred B-spline of a degree d.
+
+    β⁰ is the box on [−½, ½); β^d(x) = (((d+1)/2 + x) β^{d−1}(x+½) + ((d+1)/2 − x) β^{d−1}(x−½)) / d.
 
     Source: de Boor's recursion; Unser, Splines: a perfect fit for signal and image processing, 1999.
     """
@@ -383,9 +385,7 @@ LINEAR = Kernel("linear", bspline(1).pieces)
 CATMULL_ROM = _exact_bc(0, _HALF, "catmull-rom")
 MITCHELL = _exact_bc(Fraction(1, 3), Fraction(1, 3), "mitchell")
 # paper, eq. 13: φ_notch(x) = ½ φ_quad(x − ½) + ½ φ_quad(x + ½)
-NOTCH = _exact_bc(
-    Fraction(3, 2), Fraction(-1, 4), "notch", Factor(bspline(2), (_HALF, -_HALF), (_HALF, _HALF))
-)
+NOTCH = _exact_bc(Fraction(3, 2), Fraction(-1, 4), "notch", Factor(bspline(2), (_HALF, -_HALF), (_HALF, _HALF)))
 # ψ(x) = ½ (L(x+1) − L(x−1)): the central difference of the trilinear interpolant, as a kernel for the derivative
 CENTRAL_DIFFERENCE = Kernel(
     "central-difference",

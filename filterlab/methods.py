@@ -104,10 +104,14 @@ class Method:
         if not isinstance(self.kernel, Kernel):
             raise TypeError(f"facts come from an exact kernel; {self.kernel.name} is a {type(self.kernel).__name__}")
         evaluated = self.factor.kernel.support if self.factor else self.kernel.support
-        quasi_interpolates = self.kernel.direct_order == self.kernel.approximation_order or not self.prefilter.is_identity
-        interpolates = self.prefilter.factors == prefilters.interpolation(self.kernel).factors if _invertible(
-            self.kernel
-        ) else False
+        quasi_interpolates = (
+            self.kernel.direct_order == self.kernel.approximation_order or not self.prefilter.is_identity
+        )
+        interpolates = (
+            self.prefilter.factors == prefilters.interpolation(self.kernel).factors
+            if _invertible(self.kernel)
+            else False
+        )
         return Facts(
             support=self.kernel.support,
             taps=self.taps or evaluated**3,

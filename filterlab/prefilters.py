@@ -9,8 +9,9 @@ computed as one causal and one anticausal first-order recursion: O(n) per line.
 
 The boundary has no code here. A line is first extended by the boundary's own rule, far enough that what lies beyond
 (|z|^length below rounding) does not matter; then the recursions start from zero. So every boundary is exact, at both
-ends, for axes of 1, 2, 3, … voxels. Under mirror, reflect and wrap the coefficients extend as the samples do. Under border
-and zeros they do not: they have a tail that decays like |z|^k outside, which is kept (`tail` of `prefilter_axis`).
+ends, for axes of 1, 2, 3, … voxels. Under mirror, reflect and wrap the coefficients extend as the samples do. Under
+border and zeros they do not: they have a tail that decays like |z|^k outside, which is kept (`tail` of
+`prefilter_axis`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -70,12 +72,15 @@ class Prefilter:
 def _poles_inside(factor: tuple[Fraction, ...]) -> list[float]:
     """The roots inside the unit circle of q₀ + Σ q_k (z^k + z^−k), all real for B-splines; polished by Newton's method.
 
-    Raises ValueError when a root lies on the circle: then q̂ vanishes somewhere and cannot be inverted.
+    Raises ValueError when a root lies on the circle (q̂ vanishes somewhere and cannot be inverted) or is not real.
     """
     p = np.array([float(c) for c in (*factor[:0:-1], *factor)])
     roots = np.roots(p)
-    if np.any(np.abs(np.abs(roots) - 1) < 1e-6) or np.any(np.abs(roots.imag) > 1e-9):
-        raise ValueError(f"the discrete filter {[str(c) for c in factor]} has a zero in its response: no inverse exists")
+    taps = ", ".join(str(c) for c in factor)
+    if np.any(np.abs(np.abs(roots) - 1) < 1e-6):
+        raise ValueError(f"the discrete filter ({taps}) has a zero in its response: no inverse exists")
+    if np.any(np.abs(roots.imag) > 1e-9):
+        raise ValueError(f"the discrete filter ({taps}) has poles that are not real; such a prefilter is not offered")
     slope = np.polyder(p)
     inside = []
     for z in sorted(r.real for r in roots if abs(r) < 1):
@@ -90,7 +95,8 @@ def interpolation(kernel: Kernel) -> Prefilter:
     if kernel.interpolating:
         return IDENTITY
     samples = kernel.integer_samples()
-    taps = tuple(samples[k] for k in range(max(samples) + 1) if samples[k])
+    reach = max(k for k, value in samples.items() if value)
+    taps = tuple(samples[k] for k in range(reach + 1))
     return Prefilter(f"{kernel.name}-interpolation", (taps,))
 
 
@@ -106,15 +112,18 @@ PREFILTERS: dict[str, Prefilter] = {p.name: p for p in (IDENTITY, QUADRATIC, CUB
 
 
 class _TwoSidedExponential(torch.autograd.Function):
-    """y_k = gain · Σ_j z^|k−j| x_j along axis 0 (zero beyond the ends): a symmetric operator, so it is its own adjoint."""
+    """A causal and an anticausal recursion along axis 0, both started from zero.
+
+    With L the causal one as a matrix this is y = (1−z)² Lᵀ L x: symmetric, so it is its own adjoint, exactly.
+    """
 
     @staticmethod
     def forward(x: Tensor, pole: float) -> Tensor:
         y = x * (1 - pole) ** 2
         rows = y.unbind(0)
-        for previous, row in zip(rows[:-1], rows[1:], strict=True):
+        for previous, row in pairwise(rows):
             row.add_(previous, alpha=pole)
-        for following, row in zip(rows[:0:-1], rows[-2::-1], strict=True):
+        for following, row in pairwise(reversed(rows)):
             row.add_(following, alpha=pole)
         return y
 
@@ -150,7 +159,7 @@ def prefilter_axis(
         tail: coefficients to return beyond each end (border and zeros need them; see the head of this file).
 
     Returns:
-        the coefficients, `samples.shape` with n + 2·tail along `dim`. Linear in, and exactly differentiable by, samples.
+        the coefficients, `samples.shape` with n + 2·tail along `dim`. Linear in the samples, with an exact adjoint.
     """
     boundary = Boundary.named(boundary)
     warm_up = prefilter.decay(samples.dtype)

@@ -90,12 +90,13 @@ class Signal(Field):
 
 def _jacobian(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
     """d function_i / d point_j of a pointwise function, `(..., 3)` -> `(..., 3, 3)`; differentiable again."""
-    columns = []
+    gradient, pull_back = torch.func.vjp(function, points)[:2]
+    rows = []
     for axis in range(3):
-        direction = torch.zeros_like(points)
+        direction = torch.zeros_like(gradient)
         direction[..., axis] = 1
-        columns.append(torch.func.jvp(function, (points,), (direction,))[1])
-    return torch.stack(columns, -1)
+        rows.append(pull_back(direction)[0])
+    return torch.stack(rows, -2)
 
 
 def marschner_lobb(frequency: float = 6.0, alpha: float = 0.25, voxel_size: float | None = None) -> Signal:
@@ -194,9 +195,7 @@ def sphere(
     return Signal("sphere", function, voxel_size=voxel_size)
 
 
-def sphere_distance(
-    radius: float = 0.6, center: Corner = (0.0, 0.0, 0.0), voxel_size: float | None = None
-) -> Signal:
+def sphere_distance(radius: float = 0.6, center: Corner = (0.0, 0.0, 0.0), voxel_size: float | None = None) -> Signal:
     """The signed distance to a sphere on [−1, 1]³, negative inside: |p − c| − radius."""
 
     def function(p: Tensor) -> tuple[Tensor, Tensor]:
@@ -218,9 +217,7 @@ def gaussian(sigma: float = 0.3, center: Corner = (0.0, 0.0, 0.0), voxel_size: f
     return Signal("gaussian", function, voxel_size=voxel_size)
 
 
-def plane_wave(
-    wave_vector: Corner = (4.0, 2.0, 1.0), phase: float = 0.0, voxel_size: float | None = None
-) -> Signal:
+def plane_wave(wave_vector: Corner = (4.0, 2.0, 1.0), phase: float = 0.0, voxel_size: float | None = None) -> Signal:
     """cos(k · p + phase) on [−1, 1]³ with k in radians per world unit: one frequency, for response measurements."""
 
     def function(p: Tensor) -> tuple[Tensor, Tensor]:

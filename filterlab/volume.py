@@ -200,7 +200,7 @@ class Geometry:
         return np.linalg.inv(np.asarray(self.matrix))
 
     def _map_rows(self, rows: Tensor, matrix: np.ndarray) -> Tensor:
-        """rows · matrix; for world-aligned axes one product per component, so that nothing is mixed or rounded twice."""
+        """rows · matrix; for world-aligned axes one product per component, so that nothing is mixed."""
         if self.diagonal is not None:
             return rows * torch.as_tensor(np.diag(matrix).copy(), dtype=rows.dtype, device=rows.device)
         return rows @ torch.as_tensor(matrix.copy(), dtype=rows.dtype, device=rows.device)

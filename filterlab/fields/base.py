@@ -86,7 +86,7 @@ def check_points(points: Tensor, channels: tuple[int, int] | None) -> Tensor:
         raise ValueError(f"points must have shape (..., 3) in x, y, z order; got {tuple(points.shape)}")
     if channels is not None and (points.ndim < 2 or points.shape[0] not in (1, channels[0])):
         raise ValueError(
-            f"a batched field needs points of shape (N, ..., 3) with N = {channels[0]} (or 1); got {tuple(points.shape)}"
+            f"a batched field needs points of shape (N, ..., 3), N = {channels[0]} or 1; got {tuple(points.shape)}"
         )
     return points.to(torch.promote_types(points.dtype, torch.float32))
 

@@ -1,7 +1,7 @@
 """Fields on a grid: coefficients stored padded under the boundary, and the way from world points to them and back.
 
-Padding once means that no tap is ever folded: points are folded (or clamped) into the stored domain instead, the signs of
-gradients flipped where a reflection turned an axis round, and every boundary costs the same.
+Padding once means that no tap is ever folded: points are folded (or clamped) into the stored domain instead, the signs
+of gradients flipped where a reflection turned an axis round, and every boundary costs the same.
 """
 
 from __future__ import annotations

@@ -4,13 +4,13 @@ With T the trilinear interpolant at the point, T± at the point ± one voxel alo
 
     f = T − Σ_d ½ α_d (1 − α_d) (T₊ − 2T + T₋).
 
-Along a grid line this is the 1-D Catmull-Rom spline CR, and since CR(x) = L(x) + (the correction along that axis), with L
-the linear kernel, f is a sum of four separable terms:
+Along a grid line this is the 1-D Catmull-Rom spline CR, and since CR(x) = L(x) + (the correction along that axis), with
+L the linear kernel, f is a sum of four separable terms:
 
     f = CR⊗L⊗L + L⊗CR⊗L + L⊗L⊗CR − 2 L⊗L⊗L.
 
-It reproduces quadratic polynomials and is C⁰. Its published gradient is the central difference (T₊ − T₋)/2 of the same seven
-samples, which is not the gradient of f; both are offered.
+It reproduces quadratic polynomials and is C⁰. Its published gradient is the central difference (T₊ − T₋)/2 of the same
+seven samples, which is not the gradient of f; both are offered.
 """
 
 from __future__ import annotations

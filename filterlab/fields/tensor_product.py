@@ -1,8 +1,8 @@
 """Schemes for separable kernels: the direct sum over taps, and linear combinations of trilinear samples.
 
 `direct` sums S³ taps. `eight_trilinear` is what a texture unit wants: eight trilinear samples for a triquadratic value
-*and* its gradient (the paper's contribution), 8 + 24 for a tricubic one (Sigg & Hadwiger). On a CPU it is slower than the
-direct sum. The trilinear sample itself is pluggable; one sampler models the 8-bit fractions of a texture unit.
+*and* its gradient (the paper's contribution), 8 + 24 for a tricubic one (Sigg & Hadwiger). The trilinear sample itself
+is pluggable; one sampler models the 8-bit fractions of a texture unit.
 """
 
 from __future__ import annotations
@@ -88,7 +88,9 @@ class Direct:
         parts = [ops.jet(coefficients, points, term.kernels, order) for term in self.terms]
         if len(parts) == 1 and self.terms[0].weight == 1:
             return parts[0]
-        return sum((t.weight * p for t, p in zip(self.terms[1:], parts[1:], strict=True)), self.terms[0].weight * parts[0])
+        return sum(
+            (t.weight * p for t, p in zip(self.terms[1:], parts[1:], strict=True)), self.terms[0].weight * parts[0]
+        )
 
 
 @dataclass(frozen=True)

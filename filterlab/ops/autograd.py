@@ -1,7 +1,7 @@
 """jet and splat as differentiable operations, each the other's adjoint.
 
     d jet / d coefficients = splat          d jet / d points = the jet of one order more, contracted
-    d splat / d cotangents = jet            d splat / d points = the jet of one order more of the incoming gradient, contracted
+    d splat / d cotangents = jet            d splat / d points = the same of the incoming gradient
 
 The pair is closed under differentiation: double backward, forward mode and vmap need nothing new, and a backward pass
 keeps the coefficients and the points only, none of the gathered taps.
@@ -26,8 +26,7 @@ def _raised(order: int) -> tuple[tuple[int, ...], ...]:
     """raised[axis][row]: the row of the jet of order + 1 that is the derivative along `axis` of a row of this one."""
     rows = {m: i for i, m in enumerate(multi_indices(order + 1))}
     return tuple(
-        tuple(rows[(m[0] + (a == 0), m[1] + (a == 1), m[2] + (a == 2))] for m in multi_indices(order))
-        for a in range(3)
+        tuple(rows[(m[0] + (a == 0), m[1] + (a == 1), m[2] + (a == 2))] for m in multi_indices(order)) for a in range(3)
     )
 
 

@@ -23,9 +23,7 @@ MultiIndex = tuple[int, int, int]
 @lru_cache
 def multi_indices(order: int) -> tuple[MultiIndex, ...]:
     """The rows of a jet."""
-    return tuple(
-        (total - j, j - k, k) for total in range(order + 1) for j in range(total + 1) for k in range(j + 1)
-    )
+    return tuple((total - j, j - k, k) for total in range(order + 1) for j in range(total + 1) for k in range(j + 1))
 
 
 def locate(x: Tensor, support: int, size: int) -> tuple[Tensor, Tensor]:
@@ -55,17 +53,21 @@ class _Stencil:
         located = [
             locate(x, s, n) for x, s, n in zip(points.unbind(-1), self.supports, tuple(shape)[:-4:-1], strict=True)
         ]
-        self.first = sum(base * stride for (base, _), stride in zip(located, self.strides, strict=True))
+        (x, _), (y, _), (z, _) = located
+        self.first: Tensor = x + y * self.strides[1] + z * self.strides[2]
         self.wx, self.wy, self.wz = (tap_weights(u, k, order) for (_, u), k in zip(located, kernels, strict=True))
 
     def rows(self) -> Iterator[tuple[int, list[tuple[int, list[Tensor]]]]]:
         """For each tap z: its taps y, each with the flat indices of its row of taps x."""
         for z in range(self.supports[2]):
             start = self.first + z * self.strides[2]
-            yield z, [
-                (y, [start + (y * self.strides[1] + x) for x in range(self.supports[0])])
-                for y in range(self.supports[1])
-            ]
+            yield (
+                z,
+                [
+                    (y, [start + (y * self.strides[1] + x) for x in range(self.supports[0])])
+                    for y in range(self.supports[1])
+                ],
+            )
 
 
 def _chunks(coefficient_shape: Sequence[int], points: Tensor) -> Iterator[tuple[slice, Tensor, Tensor | int]]:

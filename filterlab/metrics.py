@@ -1,0 +1,66 @@
+"""How far two functions, gradient fields or images are apart. Image metrics come from kornia and scikit-image."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def _same_shape(a: Tensor, b: Tensor) -> None:
+    if a.shape != b.shape:
+        raise ValueError(f"both must have the same shape; got {tuple(a.shape)} and {tuple(b.shape)}")
+
+
+def rms(a: Tensor, b: Tensor, vectors: bool = False) -> Tensor:
+    """√mean |a − b|²; with vectors=True |·| is the length along the last axis (gradients)."""
+    _same_shape(a, b)
+    squared = (a - b) ** 2
+    return (squared.sum(-1) if vectors else squared).mean().sqrt()
+
+
+def max_error(a: Tensor, b: Tensor, vectors: bool = False) -> Tensor:
+    """max |a − b|; with vectors=True |·| is the length along the last axis."""
+    _same_shape(a, b)
+    return ((a - b).norm(dim=-1) if vectors else (a - b).abs()).max()
+
+
+def angular_error(a: Tensor, b: Tensor) -> Tensor:
+    """The angle between vectors `(..., 3)` in radians, `(...)`: atan2(|a × b|, a · b), accurate for tiny angles too.
+
+    Where either vector is zero the angle is NaN: it has no direction.
+    """
+    _same_shape(a, b)
+    angle = torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(-1))
+    undefined = (a == 0).all(-1) | (b == 0).all(-1)
+    return torch.where(undefined, torch.full_like(angle, torch.nan), angle)
+
+
+def psnr(a: Tensor, b: Tensor, peak: float = 1.0) -> float:
+    """Peak signal-to-noise ratio 20 log₁₀(peak / rms) in dB; infinite for equal images. Through kornia."""
+    from kornia.metrics import psnr as kornia_psnr
+
+    _same_shape(a, b)
+    return float(kornia_psnr(a.detach(), b.detach(), peak))
+
+
+def ssim(a: Tensor, b: Tensor, peak: float = 1.0) -> float:
+    """Mean structural similarity of images (H, W) or (H, W, 3), Gaussian window σ = 1.5. Through scikit-image.
+
+    Source: Wang, Bovik, Sheikh & Simoncelli, Image quality assessment, IEEE Trans. Image Processing 13, 2004.
+    """
+    from skimage.metrics import structural_similarity
+
+    _same_shape(a, b)
+    first, second = (np.asarray(t.detach().cpu(), dtype=np.float64) for t in (a, b))
+    channels = -1 if a.ndim == 3 else None
+    score = structural_similarity(
+        first,
+        second,
+        data_range=peak,
+        channel_axis=channels,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
+    return float(np.asarray(score))
