@@ -25,7 +25,7 @@ from filterlab.fields.tensor_product import (
     named_sampler,
     same_kernel,
 )
-from filterlab.kernels import Kernel, PiecewisePolynomial
+from filterlab.kernels import Kernel, PiecewisePolynomial, TensorKernel
 from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary, Volume, as_volume
 
@@ -250,7 +250,8 @@ def reconstruct(
 
     Args:
         volume: a `Volume`, or a bare tensor (D, H, W) or (N, C, D, H, W) whose voxel centres are the integers.
-        method: a name from `METHODS`, a `Method`, or a kernel.
+        method: a name from `METHODS`, a `Method`, or a kernel; an exact kernel that does not interpolate gets the
+            prefilter with which it does, a `TensorKernel` has none and needs prefilter=False.
         boundary: how the samples go on beyond the ends: mirror, reflect, wrap, border or zeros.
         prefilter: False to sum the samples themselves (blurs with a kernel that does not interpolate).
         scheme: `direct` (default) or, where the method offers it, `eight_trilinear`.
@@ -264,6 +265,8 @@ def reconstruct(
     Raises:
         ValueError: unknown name, or a combination that the method does not offer.
     """
+    if prefilter and isinstance(method, TensorKernel):
+        raise ValueError(f"the kernel {method.name} is a TensorKernel and has no prefilter; pass prefilter=False")
     volume, method, boundary = as_volume(volume), as_method(method), Boundary.named(boundary)
     chosen = method.scheme(scheme, gradient, sampler)
     coefficients = Coefficients.of(

@@ -96,26 +96,26 @@ def _separable(
     for axis, n in enumerate(shape[::-1]):
         # float64 positions: the weights are exact however large the grid, and they are few
         x = float(scale[axis]) * torch.arange(n, dtype=torch.float64, device=values.device) + float(start[axis])
-        positions.append(stored.boundary.fold(x, stored.size[axis], stored.tail)[0] - stored.start)
+        positions.append(stored.boundary.fold(x, stored.size[axis], stored.tail)[0] - stored.shift)
     total = None
     for term in field.scheme.terms:
-        part = _along_axes(values, term, positions)
+        part = _along_axes(values, term, positions, stored.start)
         total = part if total is None else total + part
     assert total is not None
     return total
 
 
-def _along_axes(values: Tensor, term: Term, positions: list[Tensor]) -> Tensor:
+def _along_axes(values: Tensor, term: Term, positions: list[Tensor], start: int) -> Tensor:
     """One separable term; the axis that shrinks most goes first, so that the passes after it have less to do."""
     axes = sorted(range(3), key=lambda a: positions[a].numel() / values.shape[-1 - a])
     for axis in axes:
-        values = _along_axis(values, -1 - axis, positions[axis], term.kernels[axis])
+        values = _along_axis(values, -1 - axis, positions[axis], term.kernels[axis], start)
     return values if term.weight == 1 else term.weight * values
 
 
-def _along_axis(values: Tensor, dim: int, positions: Tensor, kernel: PiecewisePolynomial) -> Tensor:
+def _along_axis(values: Tensor, dim: int, positions: Tensor, kernel: PiecewisePolynomial, start: int) -> Tensor:
     """Σ_t weight_t(position) · values[first tap + t] along one axis."""
-    first, u = locate(positions, kernel.support, values.shape[dim])
+    first, u = locate(positions, kernel.support, values.shape[dim], start)
     total = None
     for t, weight in enumerate(tap_weights(u, kernel, 0)[0]):
         weight = weight.to(values.dtype).reshape(-1, *(1 for _ in range(-1 - dim)))

@@ -6,8 +6,9 @@ of gradients flipped where a reflection turned an axis round, and every boundary
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -15,7 +16,6 @@ from torch import Tensor
 
 from filterlab.fields.base import Domain, Field, check_order, check_points
 from filterlab.kernels import Factor, PiecewisePolynomial
-from filterlab.ops import multi_indices
 from filterlab.prefilters import Prefilter, prefilter_axis
 from filterlab.volume import Boundary, Volume
 
@@ -50,8 +50,8 @@ class Scheme(Protocol):
     @property
     def terms(self) -> tuple[Term, ...]: ...
 
-    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
-        """(N, C, D, H, W), stored points (N, M, 3) -> (N, C, J, M), rows as in `multi_indices(order)`."""
+    def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
+        """Located points (N, M, 3) -> (N, C, J, M), rows as in `multi_indices(order)`."""
         ...
 
 
@@ -60,15 +60,17 @@ class Coefficients:
     """Coefficients padded under a boundary.
 
     Attributes:
-        values: (N, C, D', H', W').
-        start: voxel coordinate of the first stored coefficient, the same on every axis (half-integer for the notch).
+        values: (..., D', H', W'); (N, C, D', H', W') where a scheme reads them.
+        start: the first coefficient lies at start + shift in voxel coordinates, the same along every axis.
+        shift: 0, or ½ for coefficients at half-integers (the notch).
         size: voxels of the volume along x, y, z.
         boundary: the extension of the samples.
         tail: how far beyond the ends points are told apart (border and zeros); the extension is constant beyond.
     """
 
     values: Tensor
-    start: float
+    start: int
+    shift: float
     size: tuple[int, int, int]
     boundary: Boundary
     tail: int
@@ -91,17 +93,19 @@ class Coefficients:
             if not prefilter.is_identity:
                 values = prefilter_axis(values, dim, prefilter, boundary, decay)
             values = boundary.extend(values, dim, pad, pad)
-        start = -float(pad + decay)
+        shift = 0.0
         if factor is not None:
-            values, start = _apply_factor(values, factor), start + 0.5
+            values, shift = _apply_factor(values, factor), 0.5
         d, h, w = samples.shape[-3:]
-        return cls(values, start, (w, h, d), boundary, tail)
+        return cls(values, -(pad + decay), shift, (w, h, d), boundary, tail)
 
     def locate(self, voxels: Tensor) -> tuple[Tensor, Tensor]:
-        """Voxel coordinates (..., 3) to stored coordinates, and the sign ±1 or 0 of each axis."""
+        """Voxel coordinates (..., 3) folded and shifted to the coefficients, and the sign ±1 or 0 of each axis."""
         axes = [self.boundary.fold(x, n, self.tail) for x, n in zip(voxels.unbind(-1), self.size, strict=True)]
         folded = torch.stack([x for x, _ in axes], -1)
-        return folded - self.start, torch.stack([s for _, s in axes], -1)
+        if self.shift:
+            folded = folded - self.shift
+        return folded, torch.stack([s for _, s in axes], -1)
 
 
 def _apply_factor(values: Tensor, factor: Factor) -> Tensor:
@@ -136,8 +140,9 @@ class GridField(Field):
         check_order(order, self.max_order)
         points = check_points(points, self.channels)
         batched = points if self.channels is not None else points[None]
-        stored, sign = self.coefficients.locate(self.domain.geometry.to_voxel(batched.flatten(1, -2)))
-        rows = self._rows(stored, order)  # (N, C, J, M)
+        flat = batched.reshape(batched.shape[0], math.prod(batched.shape[1:-1]), 3)
+        located, sign = self.coefficients.locate(self.domain.geometry.to_voxel(flat))
+        rows = self._rows(located, order)  # (N, C, J, M)
         shape = batched.shape[1:-1]
         out = [self._shaped(rows[:, :, 0], shape)]
         if order >= 1:
@@ -148,15 +153,15 @@ class GridField(Field):
             out.append(self._shaped(self.domain.geometry.hessian_to_world(hessian), shape))
         return tuple(out)
 
-    def _rows(self, stored: Tensor, order: int) -> Tensor:
+    def _rows(self, located: Tensor, order: int) -> Tensor:
         """The scheme's jet; one set of points for a whole batch is evaluated once, with the batch as channels."""
         values = self.coefficients.values if self.channels is not None else self.coefficients.values[None, None]
         n, c = values.shape[:2]
-        if stored.shape[0] == n:
-            return self.scheme.jet(values, stored, order)
-        return self.scheme.jet(values.reshape(1, n * c, *values.shape[2:]), stored, order).reshape(
-            n, c, len(multi_indices(order)), -1
-        )
+        shared = located.shape[0] != n
+        if shared:
+            values = values.reshape(1, n * c, *values.shape[2:])
+        rows = self.scheme.jet(replace(self.coefficients, values=values), located, order)
+        return rows.reshape(n, c, *rows.shape[2:]) if shared else rows
 
     def _shaped(self, x: Tensor, shape: Sequence[int]) -> Tensor:
         """(N, C, M, ...) to (N, C, *P, ...), or (*P, ...) for an unbatched field."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from filterlab.fields.grid import Term
+from filterlab.fields.grid import Coefficients, Term
 from filterlab.fields.tensor_product import Sampler, along, unit_steps
 from filterlab.kernels import CATMULL_ROM, LINEAR
 
@@ -41,7 +41,7 @@ class SevenSamples:
     max_order: int = 1
     reach: int = 3
 
-    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+    def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
         center = self.sample(coefficients, points)
         ahead, behind = unit_steps(self.sample, coefficients, points)
         alpha = points - points.floor()

@@ -15,19 +15,22 @@ import torch
 from torch import Tensor
 
 from filterlab import ops
-from filterlab.fields.grid import Term
+from filterlab.fields.grid import Coefficients, Term
 from filterlab.kernels import CENTRAL_DIFFERENCE, LINEAR, PiecewisePolynomial, bspline, horner
 
-Sampler = Callable[[Tensor, Tensor], Tensor]
-"""(coefficients (N, C, D, H, W), stored points (N, M, 3)) -> trilinear samples (N, C, M)."""
+Sampler = Callable[[Coefficients, Tensor], Tensor]
+"""(coefficients with values (N, C, D, H, W), points (N, M, 3)) -> trilinear samples (N, C, M).
+
+The first coefficient, `coefficients.values[..., 0, 0, 0]`, lies at `coefficients.start` along every axis.
+"""
 
 
-def exact_sample(coefficients: Tensor, points: Tensor) -> Tensor:
+def exact_sample(coefficients: Coefficients, points: Tensor) -> Tensor:
     """Trilinear interpolation in the dtype of the points."""
-    return ops.jet(coefficients, points, LINEAR, 0)[:, :, 0]
+    return ops.jet(coefficients.values, points, LINEAR, 0, coefficients.start)[:, :, 0]
 
 
-def texture_unit_sample(coefficients: Tensor, points: Tensor) -> Tensor:
+def texture_unit_sample(coefficients: Coefficients, points: Tensor) -> Tensor:
     """Trilinear interpolation as a texture unit computes it: each fraction α rounded to the nearest 1/256.
 
     GPUs filter with 9-bit fixed-point weights, 8 of them fractional (CUDA C++ Programming Guide, "Linear filtering").
@@ -84,8 +87,9 @@ class Direct:
     def reach(self) -> int:
         return reach_of(self.terms)
 
-    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
-        parts = [ops.jet(coefficients, points, term.kernels, order) for term in self.terms]
+    def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
+        values, start = coefficients.values, coefficients.start
+        parts = [ops.jet(values, points, term.kernels, order, start) for term in self.terms]
         if len(parts) == 1 and self.terms[0].weight == 1:
             return parts[0]
         return sum(
@@ -106,11 +110,11 @@ class DirectCentral:
     def reach(self) -> int:
         return reach_of((*self.terms, *CENTRAL_TERMS))
 
-    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+    def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
         value = Direct(self.terms).jet(coefficients, points, 0)
         if order == 0:
             return value
-        differences = [ops.jet(coefficients, points, term.kernels, 0) for term in CENTRAL_TERMS]
+        differences = [Direct((term,)).jet(coefficients, points, 0) for term in CENTRAL_TERMS]
         return torch.cat([value, *differences], 2)
 
 
@@ -129,7 +133,7 @@ class EightTrilinearQuadratic:
     max_order: int = 1
     reach: int = 2
 
-    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+    def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
         beta = points - (points + 0.5).floor()
         ends = (points - (0.25 + 0.5 * beta), points + (0.25 - 0.5 * beta))
         samples = _at_corners(self.sample, coefficients, ends, ends, ends)
@@ -156,7 +160,7 @@ class EightTrilinearCubic:
     max_order: int = 1
     reach: int = 3
 
-    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+    def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
         cell = points.floor()
         pairs = [_paired(cell, points - cell, derivative) for derivative in range(order + 1)]
         choices = [(0, 0, 0)] + ([(1, 0, 0), (0, 1, 0), (0, 0, 1)] if order else [])
@@ -177,7 +181,7 @@ def _paired(cell: Tensor, alpha: Tensor, derivative: int) -> tuple[tuple[Tensor,
 
 def _at_corners(
     sample: Sampler,
-    coefficients: Tensor,
+    coefficients: Coefficients,
     x: tuple[Tensor, Tensor],
     y: tuple[Tensor, Tensor],
     z: tuple[Tensor, Tensor],
@@ -208,7 +212,7 @@ class TrilinearCentral:
     max_order: int = 1
     reach: int = 3
 
-    def jet(self, coefficients: Tensor, points: Tensor, order: int) -> Tensor:
+    def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
         value = self.sample(coefficients, points)
         if order == 0:
             return value[:, :, None]
@@ -216,7 +220,7 @@ class TrilinearCentral:
         return torch.stack([value, *((a - b) / 2 for a, b in zip(ahead, behind, strict=True))], 2)
 
 
-def unit_steps(sample: Sampler, coefficients: Tensor, points: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+def unit_steps(sample: Sampler, coefficients: Coefficients, points: Tensor) -> tuple[list[Tensor], list[Tensor]]:
     """Trilinear samples one voxel ahead and one behind along x, y and z."""
     steps = torch.eye(3, dtype=points.dtype, device=points.device)
     return [sample(coefficients, points + s) for s in steps], [sample(coefficients, points - s) for s in steps]

@@ -39,15 +39,17 @@ def jet(
     points: Tensor,
     kernels: PiecewisePolynomial | Sequence[PiecewisePolynomial],
     order: int = 0,
+    start: int = 0,
 ) -> Tensor:
     """All partial derivatives up to `order` of Σ_k c_k φ_x(x−k_x) φ_y(y−k_y) φ_z(z−k_z) at the points.
 
     Args:
         coefficients: (N, C, D, H, W), any real dtype, each axis at least as long as its kernel's support.
-        points: (N, M, 3), x, y, z in stored coordinates: coefficient 0 of an axis lies at 0. Points beyond the stored
-            coefficients are extrapolated from the outermost polynomial piece; nothing is read out of bounds.
+        points: (N, M, 3), x, y, z. Points beyond the coefficients are extrapolated from the outermost polynomial piece;
+            nothing is read out of bounds.
         kernels: one kernel, or one per axis x, y, z.
         order: 0 value, 1 + gradient, 2 + Hessian, …; rows as in `multi_indices(order)`.
+        start: the coordinate of coefficient 0, the same along every axis (negative for padded coefficients).
 
     Returns:
         (N, C, J, M) in the dtype of the points.
@@ -59,8 +61,8 @@ def jet(
         raise ValueError(f"coefficients must have shape (N, C, D, H, W); got {tuple(coefficients.shape)}")
     _check(coefficients, points, kernels, order, coefficients.shape[2:])
     if all(isinstance(k, Kernel) for k in kernels):
-        return autograd.jet(coefficients, points, kernels, order)  # type: ignore[arg-type]
-    return reference.jet(coefficients, points, kernels, order)
+        return autograd.jet(coefficients, points, kernels, order, start)  # type: ignore[arg-type]
+    return reference.jet(coefficients, points, kernels, order, start)
 
 
 def splat(
@@ -69,12 +71,13 @@ def splat(
     kernels: PiecewisePolynomial | Sequence[PiecewisePolynomial],
     order: int,
     shape: Sequence[int],
+    start: int = 0,
 ) -> Tensor:
     """The adjoint of `jet`: ⟨jet(c), g⟩ = ⟨c, splat(g)⟩.
 
     Args:
         cotangents: (N, C, J, M), as `jet` returns.
-        points, kernels, order: as for `jet`.
+        points, kernels, order, start: as for `jet`.
         shape: (D, H, W) of the result.
 
     Returns:
@@ -86,5 +89,5 @@ def splat(
         raise ValueError(f"cotangents must have shape (N, C, {rows}, M); got {tuple(cotangents.shape)}")
     _check(cotangents, points, kernels, order, shape)
     if all(isinstance(k, Kernel) for k in kernels):
-        return autograd.splat(cotangents, points, kernels, order, tuple(shape))  # type: ignore[arg-type]
-    return reference.splat(cotangents, points, kernels, order, shape)
+        return autograd.splat(cotangents, points, kernels, order, tuple(shape), start)  # type: ignore[arg-type]
+    return reference.splat(cotangents, points, kernels, order, shape, start)

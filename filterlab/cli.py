@@ -1,0 +1,434 @@
+"""The command `filterlab`: render | resample | methods | info.
+
+Exit codes: 0 done, 1 a mistake in what was asked (a message on stderr), 2 a command line that makes no sense,
+130 interrupted. What is slow to import is imported by the command that needs it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import os
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Union
+
+import tyro
+from tyro.conf import Positional, arg, subcommand
+
+if TYPE_CHECKING:
+    import torch
+
+    from filterlab.io.bounded import VolumeHeader
+    from filterlab.volume import Volume
+
+OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+BINS = 16
+
+Triple = tuple[float, float, float]
+Output = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
+
+
+class UsageError(ValueError):
+    """A command line that makes no sense: exit code 2."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Make a picture of a volume or a signal, as a scene file describes it.
+
+    A scene is a YAML file: what is shown, how it is reconstructed, the transfer function, the camera, the lights. Any
+    of its values can be changed on the command line, after the name of the scene, by its path in the file.
+
+    examples:
+      filterlab render engine.yaml -o engine.png
+      filterlab render engine.yaml -o notch.png --method notch --size 512 512
+      filterlab render engine.yaml -o zoom.png --camera.window 0.4 0.4 0.6 0.6 --volume.file other.nrrd
+    """
+
+    scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml")]
+    """The scene."""
+    output: Output
+    """The picture to write: a name that ends in .png."""
+
+    def run(self, overrides: dict[str, str]) -> None:
+        from filterlab.io.atomic import check_writable
+
+        if self.output.suffix.lower() != ".png":
+            raise ValueError(f"expected a picture's name that ends in .png; got {self.output}")
+        check_writable(self.output)
+        _check_not_input(self.output, self.scene)
+
+        from filterlab.io.images import save_image
+        from filterlab.render.scene import load_scene, render_scene
+
+        scene = load_scene(self.scene, overrides)
+        if scene.volume is not None:
+            _check_not_input(self.output, Path(scene.volume.file))
+        _check_device(scene.device)
+        save_image(render_scene(scene, progress=None), self.output)
+
+
+@dataclass(frozen=True)
+class Resample:
+    """Put a volume on another grid: finer, coarser, or that of another volume.
+
+    The volume is reconstructed by the chosen method and sampled anew; it stays where it is in the world. Making it
+    coarser does not blur first. Files: NRRD, NIfTI, TIFF stacks, .npy, .npz and .raw with a sidecar are read; .nrrd,
+    .nii, .nii.gz, .npy and .npz are written.
+
+    examples:
+      filterlab resample engine.nrrd -o fine.nrrd --method notch --spacing 0.5 0.5 0.5
+      filterlab resample engine.nrrd -o small.nii.gz --shape 128 128 64 --dtype input
+      filterlab resample pet.nii.gz -o pet_on_ct.nii.gz --like ct.nii.gz --boundary border
+    """
+
+    input: Annotated[Positional[Path], arg(metavar="IN")]
+    """The volume: a file, or a folder of numbered TIFF slices."""
+    output: Output
+    """The volume to write."""
+    method: str = "triquadratic"
+    """How values between the voxels are found; `filterlab methods` lists the names."""
+    spacing: Annotated[Triple | None, arg(metavar="SX SY SZ")] = None
+    """New size of a voxel along x, y, z, in the volume's own units."""
+    shape: Annotated[tuple[int, int, int] | None, arg(metavar="NX NY NZ")] = None
+    """Instead of it: new number of voxels along x, y, z."""
+    like: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Instead of it: a volume file whose grid is taken over."""
+    boundary: str = "mirror"
+    """How the volume goes on beyond its ends: mirror, reflect, wrap, border or zeros."""
+    dtype: str = "float32"
+    """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN."""
+    max_gigabytes: float = 8.0
+    """The most memory that one volume may take."""
+
+    def run(self, overrides: dict[str, str]) -> None:
+        from filterlab.io.atomic import check_writable
+
+        asked = [self.spacing is not None, self.shape is not None, self.like is not None]
+        if sum(asked) != 1:
+            raise UsageError(
+                "expected one of --spacing, --shape and --like; got " + ("several" if any(asked) else "none")
+            )
+        check_writable(self.output)
+        for path in (self.input, self.like):
+            if path is not None:
+                _check_not_input(self.output, path)
+
+        import torch
+
+        from filterlab.io.volumes import check_saveable, describe, load_volume, save_volume
+        from filterlab.methods import METHODS
+        from filterlab.resampling import resample
+        from filterlab.volume import Boundary, Volume
+
+        _check_name("method", self.method, METHODS)
+        _check_name("boundary", self.boundary, Boundary)
+        source = describe(self.input)
+        target = None if self.like is None else describe(self.like)
+        dtype = _result_type(self.dtype, source)
+        check_saveable(self.output, batched=len(source.shape) == 5)
+        limit = int(self.max_gigabytes * 2**30)
+        _check_memory(self._new_size(source, target), source, limit)
+        volume = load_volume(self.input, max_bytes=limit)
+        working = torch.float64 if torch.float64 in (dtype, volume.dtype) else torch.float32
+        grid: dict = {"spacing": self.spacing} if self.spacing else {"shape": self.shape[::-1] if self.shape else None}
+        if target is not None:  # a grid without samples: one voxel, shown over and over
+            grid = {"like": Volume.with_geometry(torch.zeros(()).expand(target.shape[-3:]), target.geometry)}
+        result = resample(volume, self.method, boundary=self.boundary, dtype=working, **grid)
+        save_volume(_converted(result, dtype), self.output)
+
+    def _new_size(self, source: VolumeHeader, target: VolumeHeader | None) -> list[float]:
+        """Voxels along x, y, z of the result; checks what was asked."""
+        if target is not None:
+            return list(target.size)
+        if self.shape is not None:
+            if min(self.shape) < 1:
+                raise ValueError(f"expected --shape of 1 or more voxels along every axis; got {self.shape}")
+            return list(self.shape)
+        assert self.spacing is not None
+        if not all(math.isfinite(s) and s > 0 for s in self.spacing):
+            raise ValueError(f"expected a --spacing of positive numbers; got {self.spacing}")
+        return [max(1.0, n * s / t) for n, s, t in zip(source.size, source.spacing, self.spacing, strict=True)]
+
+
+@dataclass(frozen=True)
+class Methods:
+    """List the reconstruction methods and what each promises.
+
+    support: voxels that one value depends on along an axis. order: L, the error falls as the L-th power of the voxel
+    size (and without the prefilter). smooth: C0 continuous, C1 its gradient too, C2 its curvature too. samples: whether
+    the reconstruction returns the samples at the voxel centres (and without the prefilter).
+    """
+
+    def run(self, overrides: dict[str, str]) -> None:
+        from rich.table import Table
+
+        from filterlab.methods import METHODS
+
+        table = Table("method", "support", "taps", "order", "smooth", "samples", "gradients", "schemes", "what it is")
+        for name, method in METHODS.items():
+            f = method.facts
+            table.add_row(
+                name,
+                str(f.support),
+                str(f.taps),
+                _both(str(f.approximation_order), str(f.approximation_order_without_prefilter), f.prefiltered),
+                f"C{f.continuity}",
+                _both(_yes(f.interpolating), _yes(f.interpolating_without_prefilter), f.prefiltered),
+                ", ".join(f.gradients),
+                ", ".join(f.schemes),
+                method.summary,
+            )
+        _show(table)
+
+
+@dataclass(frozen=True)
+class Info:
+    """Show what is in a volume file: its header, where it lies in the world, and how its values are distributed.
+
+    examples:
+      filterlab info engine.nrrd
+      filterlab info scan.nii.gz --header-only
+    """
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The volume: a file, or a folder of numbered TIFF slices."""
+    header_only: Annotated[bool, arg(aliases=["-H"])] = False
+    """Do not read the voxels."""
+
+    def run(self, overrides: dict[str, str]) -> None:
+        from rich.table import Table
+        from rich.text import Text
+
+        from filterlab.io.volumes import describe, load_volume
+
+        header = describe(self.file)
+        table = Table(show_header=False, box=None)
+        for name, value in _described(header):
+            table.add_row(name, Text(value))
+        _show(table)
+        if not self.header_only:
+            table = Table(show_header=False, box=None)
+            for name, value in _distribution(load_volume(self.file).samples):
+                table.add_row(name, Text(value))
+            _show(table)
+
+
+DESCRIPTION = """Reconstruction filters for sampled volumes: look at scans, resample them, compare methods.
+
+filterlab COMMAND --help tells more, with examples. filterlab --version tells the version."""
+
+COMMANDS: dict[str, Any] = {"render": Render, "resample": Resample, "methods": Methods, "info": Info}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments in (["--version"], ["-V"]):
+        print(f"filterlab {version('filterlab')}")
+        return OK
+    overrides: dict[str, str] = {}
+    try:
+        if arguments[:1] == ["render"]:
+            arguments, overrides = split_overrides(arguments)
+        _parse(arguments or ["--help"]).run(overrides)
+    except SystemExit as exit:  # tyro: --help, or usage
+        return exit.code if isinstance(exit.code, int) else USAGE
+    except UsageError as error:
+        print(f"filterlab: {error} (see filterlab {arguments[0]} --help)", file=sys.stderr)
+        return USAGE
+    except BrokenPipeError:  # the reader of our output has gone, as in `filterlab methods | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except (ValueError, OSError) as error:
+        print(f"filterlab: {_message(error)}", file=sys.stderr)
+        return FAILED
+    except MemoryError as error:
+        print(f"filterlab: expected more memory than there is; {error}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("filterlab: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    return OK
+
+
+def _parse(arguments: list[str]) -> Any:
+    """The command that was asked for. tyro prints help and mistakes of usage, and exits."""
+    name = arguments[0]
+    if name in COMMANDS:
+        kind = COMMANDS[name]
+        return tyro.cli(kind, prog=f"filterlab {name}", description=inspect.cleandoc(kind.__doc__), args=arguments[1:])
+    kinds = (Annotated[k, subcommand(n, description=k.__doc__.split("\n")[0])] for n, k in COMMANDS.items())
+    return tyro.cli(Union[tuple(kinds)], prog="filterlab", description=DESCRIPTION, args=arguments)  # noqa: UP007
+
+
+def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """What belongs to the command itself, and the changes to the scene: `--key value …` -> {key: YAML text}.
+
+    `--size 512 512` is {"size": "[512, 512]"}; `--key=value` and `--key value` are the same; a key alone is true.
+
+    Raises UsageError for a key that is given twice.
+    """
+    known: list[str] = []
+    overrides: dict[str, str] = {}
+    rest = list(arguments)
+    while rest:
+        token = rest.pop(0)
+        if token in ("-o", "--output"):
+            known += [token, *rest[:1]]
+            del rest[:1]
+        elif token.startswith("--") and len(token) > 2 and token != "--help" and not token.startswith("--output="):
+            key, equals, value = token[2:].partition("=")
+            values = [value] if equals else []
+            while not equals and rest and not re.match(r"-[-a-zA-Z]", rest[0]):
+                values.append(rest.pop(0))
+            if key in overrides:
+                raise UsageError(f"expected every field once; got --{key} again")
+            overrides[key] = "true" if not values else values[0] if len(values) == 1 else f"[{', '.join(values)}]"
+        else:
+            known.append(token)
+    return known, overrides
+
+
+def _message(error: ValueError | OSError) -> str:
+    """The text of an error; for the operating system's own, what it says about which file."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or ''}: {error.strerror}".removeprefix(": ")
+    return str(error)
+
+
+def _check_not_input(output: Path, source: Path) -> None:
+    if os.path.realpath(output) == os.path.realpath(source):
+        raise ValueError(f"expected an output other than the input; got {output} for both")
+
+
+def _check_name(what: str, name: str, known: object) -> None:
+    from filterlab.io.config import unknown_name
+
+    names = [str(k) for k in known]  # type: ignore[attr-defined]
+    if name not in names:
+        raise ValueError(unknown_name(what, name, names))
+
+
+def _check_device(name: str) -> None:
+    import torch
+
+    try:
+        torch.empty(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"device: expected a device that torch can use here, like cpu; got {name!r} ({reason})"
+        ) from None
+
+
+def _result_type(name: str, source: VolumeHeader) -> torch.dtype:
+    import torch
+
+    types = {n: getattr(torch, n) for n in ("float32", "float64", "uint8", "int8", "int16", "int32", "int64")}
+    _check_name("dtype", name, [*types, "input"])
+    return source.dtype if name == "input" else types[name]
+
+
+def _check_memory(size: Sequence[float], source: VolumeHeader, limit: int) -> None:
+    needed = math.prod(size) * math.prod(source.shape[:-3]) * 4
+    if needed > limit:
+        shape = " × ".join(f"{n:.6g}" for n in size)
+        raise ValueError(
+            f"expected a result of at most {limit / 2**30:g} GiB (--max-gigabytes); got {shape} voxels, "
+            f"{needed / 2**30:.3g} GiB"
+        )
+
+
+def _converted(volume: Volume, dtype: torch.dtype) -> Volume:
+    """The volume in that type; integers are rounded, and clipped to what the type holds."""
+    import torch
+
+    if dtype.is_floating_point:
+        return volume.to(dtype)
+    info = torch.iinfo(dtype)
+    samples = volume.samples.round().clamp(info.min, info.max)
+    top = samples >= float(info.max)  # the largest int64 is no float: converting it would wrap round
+    return type(volume).with_geometry(samples.to(dtype).masked_fill(top, info.max), volume.geometry)
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"
+
+
+def _both(with_prefilter: str, without: str, prefiltered: bool) -> str:
+    return f"{with_prefilter} ({without})" if prefiltered else with_prefilter
+
+
+def _show(renderable: object) -> None:
+    """Prints a table; wide where the output is a file or a pipe, so that nothing is cut off."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(width=200, highlight=False)
+    console.print(renderable)
+
+
+def _described(header: VolumeHeader) -> list[tuple[str, str]]:
+    """Lines about a volume's header."""
+    import numpy as np
+
+    def numbers(values: Sequence[float]) -> str:
+        return " ".join(f"{v:.6g}" for v in values)
+
+    dtype = str(header.dtype).removeprefix("torch.")
+    extent = [n * s for n, s in zip(header.size, header.spacing, strict=True)]
+    lines = [
+        ("file", f"{header.path} ({header.format}, {header.encoding})"),
+        ("size (x, y, z)", " × ".join(map(str, header.size))),
+        ("type", header.stored if header.stored == dtype else f"{header.stored}, read as {dtype}"),
+        ("memory", f"{header.nbytes / 2**20:.4g} MiB"),
+        ("spacing", numbers(header.spacing)),
+        ("origin", numbers(header.origin)),
+        ("extent", numbers(extent)),
+        ("world axes", header.world or "not declared"),
+    ]
+    if len(header.shape) == 5:
+        lines.insert(2, ("batch, channels", f"{header.shape[0]}, {header.shape[1]}"))
+    if np.count_nonzero(header.affine[:3, :3] - np.diag(header.spacing)):
+        lines += [("affine" if i == 0 else "", numbers(row)) for i, row in enumerate(header.affine)]
+    return lines + list(header.fields.items())
+
+
+def _distribution(samples: torch.Tensor) -> list[tuple[str, str]]:
+    """Range, mean and a histogram of the finite values."""
+    import torch
+
+    values = samples.flatten()
+    lines = []
+    if values.dtype.is_floating_point:
+        finite = values[values.isfinite()]
+        lines += [("not finite", str(values.numel() - finite.numel()))] if finite.numel() < values.numel() else []
+        values = finite
+    if values.numel() == 0:
+        return [*lines, ("range", "no finite values")]
+    low, high = (float(v) for v in values.aminmax())
+    lines += [("range", f"{low:.6g} … {high:.6g}"), ("mean", f"{values.double().mean():.6g}")]
+    if high == low:
+        return lines
+    span = high - low
+    bins = min(BINS, int(span) + 1) if not values.dtype.is_floating_point else BINS
+    place = ((values.double() - low) * (bins / (span + (0 if values.dtype.is_floating_point else 1)))).long()
+    counts = torch.bincount(place.clamp_(0, bins - 1), minlength=bins)
+    return lines + _bars(counts.tolist(), low, span + (0 if values.dtype.is_floating_point else 1))
+
+
+def _bars(counts: list[int], low: float, span: float) -> list[tuple[str, str]]:
+    """One line per bin: where it begins, its share, and a bar on a logarithmic scale (1 voxel to all of them)."""
+    total, width = sum(counts), span / len(counts)
+    lines = []
+    for i, count in enumerate(counts):
+        bar = "█" * (1 + round(29 * math.log(count) / max(math.log(total), 1e-9))) if count else ""
+        lines.append((f"from {low + i * width:.6g}", f"{100 * count / total:6.2f} %  {bar}"))
+    return lines
