@@ -112,14 +112,12 @@ class Boundary(StrEnum):
 def _reflect_at(x: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
     """x reflected at `low` and `high` until it lies between, and ±1 = d reflected / d x."""
     period = 2 * (high - low)
-    inside = (x >= low) & (x <= high)
-    r = x.fmod(period) - low  # fmod first: it is exact, so 1e8 folds as exactly as 1
-    r = torch.where(r < 0, r + period, r)
-    r = torch.where(r >= period, r - period, r)
-    rising = r <= high - low
-    folded = torch.where(rising, r, period - r) + low
-    sign = torch.where(inside | rising, torch.ones_like(x), -torch.ones_like(x))
-    return torch.where(inside, x, folded), sign
+    outside = (x < low) | (x > high)
+    w = x.fmod(period) - low  # fmod first: it is exact, so 1e8 folds as exactly as 1
+    r = w.abs()
+    other = (period - r).abs()
+    turned = outside & ((w < 0) ^ (other < r) ^ (r > period))
+    return torch.where(outside, torch.minimum(r, other) + low, x), 1 - 2 * turned.to(x.dtype)
 
 
 def _triple(name: str, value: Sequence[float] | Tensor | np.ndarray | float) -> tuple[float, float, float]:

@@ -1,0 +1,31 @@
+from . import io, kernels, metrics, prefilters, render, signals, spectrum
+from .fields.base import Field
+from .io.volumes import load_volume, save_volume
+from .kernels import KERNELS
+from .methods import METHODS, Method, reconstruct
+from .prefilters import PREFILTERS
+from .resampling import resample
+from .volume import Boundary, Volume, from_grid_sample, from_zyx
+
+__all__ = [
+    "KERNELS",
+    "METHODS",
+    "PREFILTERS",
+    "Boundary",
+    "Field",
+    "Method",
+    "Volume",
+    "from_grid_sample",
+    "from_zyx",
+    "io",
+    "kernels",
+    "load_volume",
+    "metrics",
+    "prefilters",
+    "reconstruct",
+    "render",
+    "resample",
+    "save_volume",
+    "signals",
+    "spectrum",
+]
