@@ -47,7 +47,7 @@ class Render:
     examples:
       filterlab render engine.yaml -o engine.png
       filterlab render engine.yaml -o notch.png --method notch --size 512 512
-      filterlab render engine.yaml -o zoom.png --camera.window 0.4 0.4 0.6 0.6 --volume.file other.nrrd
+      filterlab render engine.yaml -o zoom.png --camera.window 0.4 0.4 0.6 0.6 --volume other.nrrd
     """
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml")]
@@ -264,7 +264,8 @@ def _parse(arguments: list[str]) -> Any:
         kind = COMMANDS[name]
         return tyro.cli(kind, prog=f"filterlab {name}", description=inspect.cleandoc(kind.__doc__), args=arguments[1:])
     kinds = (Annotated[k, subcommand(n, description=k.__doc__.split("\n")[0])] for n, k in COMMANDS.items())
-    return tyro.cli(Union[tuple(kinds)], prog="filterlab", description=DESCRIPTION, args=arguments)  # noqa: UP007
+    any_of_them: Any = Union[tuple(kinds)]  # noqa: UP007
+    return tyro.cli(any_of_them, prog="filterlab", description=DESCRIPTION, args=arguments)
 
 
 def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:

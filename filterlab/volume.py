@@ -240,7 +240,7 @@ class Volume:
 
     Raises:
         ValueError: wrong number of axes, an axis without voxels, non-positive spacing, singular affine.
-        TypeError: samples are no tensor, or complex or boolean.
+        TypeError: samples are no tensor, or complex, boolean or unsigned of more than 8 bits.
     """
 
     def __init__(
@@ -318,6 +318,8 @@ def _checked_samples(samples: Tensor) -> Tensor:
         raise ValueError(f"every axis of a volume needs at least one voxel; got shape {tuple(samples.shape)}")
     if samples.dtype.is_complex or samples.dtype == torch.bool:
         raise TypeError(f"samples must be real numbers; got {samples.dtype}")
+    if samples.dtype in (torch.uint16, torch.uint32, torch.uint64):
+        raise TypeError(f"torch cannot index {samples.dtype}; convert: samples.to(torch.int32), int64 or float32")
     return samples
 
 

@@ -26,7 +26,11 @@ The first coefficient, `coefficients.values[..., 0, 0, 0]`, lies at `coefficient
 
 
 def exact_sample(coefficients: Coefficients, points: Tensor) -> Tensor:
-    """Trilinear interpolation in the dtype of the points."""
+    """Trilinear interpolation in the dtype of the points.
+
+    A float32 position x is rounded to about 6e-8·x voxels, as a texture coordinate is: on an axis of 512 voxels the
+    eight-trilinear schemes are off by up to 8e-5 of the range, where the direct sum, which moves no point, keeps 5e-7.
+    """
     return ops.jet(coefficients.values, points, LINEAR, 0, coefficients.start)[:, :, 0]
 
 

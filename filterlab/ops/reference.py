@@ -7,6 +7,7 @@ order of a derivative. A jet's rows are the multi-indices (m_x, m_y, m_z), m_x +
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
@@ -119,7 +120,7 @@ def jet(
     """
     n, c = coefficients.shape[:2]
     rows = multi_indices(order)
-    flat = coefficients.transpose(0, 1).reshape(c, -1)
+    flat = coefficients.transpose(0, 1).reshape(c, n * math.prod(coefficients.shape[2:]))
     parts = []
     for _, chunk, offset in _chunks(coefficients.shape, points):
         stencil = _Stencil(chunk, offset, kernels, order, coefficients.shape, start)
@@ -179,7 +180,7 @@ def splat(
     n, c = cotangents.shape[:2]
     full = (n, c, *shape)
     out = points.new_zeros((c, n * shape[0] * shape[1] * shape[2]))
-    flat = cotangents.permute(2, 1, 0, 3).reshape(cotangents.shape[2], c, -1)  # (J, C, N·M)
+    flat = cotangents.permute(2, 1, 0, 3).reshape(cotangents.shape[2], c, n * points.shape[1])  # (J, C, N·M)
     for part, chunk, offset in _chunks(full, points):
         stencil = _Stencil(chunk, offset, kernels, order, full, start)
         jets = dict(zip(multi_indices(order), flat[..., part].to(points.dtype), strict=True))
