@@ -1,0 +1,59 @@
+"""Files that appear whole or not at all: written under a temporary name, then renamed."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+def check_writable(path: str | os.PathLike[str]) -> Path:
+    """The path, once it is known that a file can be created there. Call it before long work begins.
+
+    Raises:
+        FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError: what is wrong with the place.
+    """
+    path = Path(path)
+    folder = Path(os.path.realpath(path)).parent
+    if not folder.exists():
+        raise FileNotFoundError(f"cannot write {path}: expected an existing folder; got {folder}, which does not exist")
+    if not folder.is_dir():
+        raise NotADirectoryError(f"cannot write {path}: expected a folder; got {folder}, which is a file")
+    if path.is_dir():
+        raise IsADirectoryError(f"cannot write {path}: expected a file name; got a folder")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"cannot write {path}: expected a writable folder; got {folder}, which is not")
+    return path
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path in the folder of `path`; renamed to `path` on success, removed on any error or Ctrl-C.
+
+        with atomic_write("image.png") as temporary:
+            temporary.write_bytes(data)
+
+    The temporary name keeps the endings of `path` (`.nii.gz`), for writers that look at them. A reader of `path` sees
+    the old file or the new one, never a part. A symbolic link stays a link: the file it points to is replaced.
+
+    Raises:
+        OSError: the folder does not exist or is not writable (before the block runs), or the block's own error.
+    """
+    check_writable(path)
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".tmp-{secrets.token_hex(8)}{''.join(target.suffixes[-2:])}")
+    try:
+        yield temporary
+        _flush(temporary)
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def _flush(path: Path) -> None:
+    """Hand the file's bytes to the disk before its name changes, so that a power cut leaves no empty file."""
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())

@@ -1,0 +1,176 @@
+"""NIfTI volumes (`.nii`, `.nii.gz`), NIfTI-1 and -2, with nibabel reading the header (the extra `medical`).
+
+World coordinates are the file's: right, anterior, superior (RAS), from the sform if it is set, else the qform, else the
+voxel sizes. scl_slope and scl_inter are applied; the result is then float32 (float64 where 32 or 64 bits are stored).
+The voxels are read by our own bounded reader, never by nibabel.
+
+Source: https://nifti.nimh.nih.gov/nifti-1 and the headers nifti1.h, nifti2.h.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import math
+import warnings
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from filterlab.io.bounded import (
+    Stored,
+    VolumeFileError,
+    VolumeHeader,
+    as_tensor,
+    check_geometry,
+    check_size,
+    damaged,
+    rescaled,
+    sample_dtype,
+    storable,
+)
+from filterlab.volume import Volume
+
+HEADER_BYTES = {348: 352, 540: 544}  # sizeof_hdr -> bytes up to the first possible voxel
+_WRITTEN = ("uint8", "int8", "int16", "int32", "int64", "float32", "float64")
+
+
+def require_nibabel(path: Path) -> Any:
+    """The package nibabel. Raises VolumeFileError that names the extra to install."""
+    try:
+        import nibabel
+    except ImportError:
+        raise VolumeFileError(
+            path, "nibabel, which reads NIfTI (pip install 'filterlab[medical]')", "no such package"
+        ) from None
+    return nibabel
+
+
+def read_header(path: Path) -> VolumeHeader:
+    """The checked header of a NIfTI file. Raises VolumeFileError."""
+    nibabel = require_nibabel(path)
+    compressed = path.name.lower().endswith(".gz")
+    block = _first_bytes(path, compressed)
+    little, big = (int.from_bytes(block[:4], order) for order in ("little", "big"))
+    kind = little if little in HEADER_BYTES else big
+    if kind not in HEADER_BYTES or len(block) < HEADER_BYTES[kind]:
+        raise VolumeFileError(path, "a NIfTI header (its first number 348 or 540)", f"{little} in {len(block)} bytes")
+    cls = nibabel.Nifti1Header if kind == 348 else nibabel.Nifti2Header
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            header = cls(block[:kind], endianness="<" if kind == little else ">", check=False)
+            return _checked(path, header, kind, compressed)
+        except VolumeFileError:
+            raise
+        except Exception as error:  # whatever nibabel makes of damaged fields
+            raise VolumeFileError(path, "a valid NIfTI header", f"{type(error).__name__}: {error}"[:200]) from None
+
+
+def _first_bytes(path: Path, compressed: bool) -> bytes:
+    with path.open("rb") as file, ExitStack() as stack:
+        stream = stack.enter_context(gzip.GzipFile(fileobj=file)) if compressed else file
+        with damaged(path, "a NIfTI header"):
+            return stream.read(max(HEADER_BYTES.values()))
+
+
+def _checked(path: Path, header: Any, kind: int, compressed: bool) -> VolumeHeader:
+    magic = bytes(header["magic"].tobytes())
+    if not magic.startswith((b"n+1", b"n+2")):
+        raise VolumeFileError(path, "a single NIfTI file (magic n+1 or n+2)", repr(magic))
+    size = _size(path, [int(n) for n in header["dim"]])
+    try:
+        dtype = header.get_data_dtype()
+    except Exception:
+        raise VolumeFileError(path, "a known data type", f"code {int(header['datatype'])}") from None
+    stored_dtype = sample_dtype(path, dtype)
+    if int(header["bitpix"]) != 8 * dtype.itemsize:
+        raise VolumeFileError(path, f"bitpix {8 * dtype.itemsize} for {dtype.name}", int(header["bitpix"]))
+    offset = float(header["vox_offset"])
+    if not math.isfinite(offset) or offset != int(offset) or not HEADER_BYTES[kind] <= offset < 2**62:
+        raise VolumeFileError(path, f"a vox_offset of at least {HEADER_BYTES[kind]}", offset)
+    start = int(offset)
+    stored = Stored(
+        *(path, path, "gzip" if compressed else "raw"), 0 if compressed else start, start if compressed else 0,
+        *(size[::-1], dtype),
+    )  # fmt: skip
+    stored.check()
+    slope, intercept = _scaling(path, header)
+    plain = (slope, intercept) == (1.0, 0.0)
+    wide = torch.float64 if dtype.itemsize > 2 and dtype.name != "float32" else torch.float32
+    target = stored_dtype if plain else wide
+    return VolumeHeader(
+        path,
+        "NIfTI",
+        size[::-1],
+        dtype.name,
+        check_geometry(path, header.get_best_affine()),
+        stored.encoding,
+        "RAS",
+        _fields(header, slope, intercept),
+        target,
+        lambda: as_tensor(stored.read(), target) if plain else rescaled(stored.read(), slope, intercept, target),
+    )
+
+
+def _size(path: Path, dim: list[int]) -> tuple[int, ...]:
+    rank = dim[0]
+    if not 1 <= rank <= 7:
+        raise VolumeFileError(path, "dim[0], the number of axes, from 1 to 7", rank)
+    size = check_size(path, dim[1 : rank + 1])
+    if rank < 3 or any(n != 1 for n in size[3:]):
+        raise VolumeFileError(path, "three axes of one value per voxel (no images, channels or time)", f"sizes {size}")
+    return size[:3]
+
+
+def _scaling(path: Path, header: Any) -> tuple[float, float]:
+    """(slope, intercept); a slope of 0 or NaN means none."""
+    slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
+    if slope == 0 or math.isnan(slope):
+        return 1.0, 0.0
+    if not (math.isfinite(slope) and math.isfinite(intercept)):
+        raise VolumeFileError(path, "finite scl_slope and scl_inter", f"{slope} and {intercept}")
+    return slope, intercept
+
+
+def _fields(header: Any, slope: float, intercept: float) -> dict[str, str]:
+    fields = {
+        "description": bytes(header["descrip"].tobytes()).split(b"\0")[0].decode("latin-1"),
+        "units": header.get_xyzt_units()[0],
+        "affine from": "sform" if header["sform_code"] > 0 else "qform" if header["qform_code"] > 0 else "voxel sizes",
+    }
+    if (slope, intercept) != (1.0, 0.0):
+        fields["scaling"] = f"{slope} · stored + {intercept}"
+    return {k: v for k, v in fields.items() if v}
+
+
+def write(volume: Volume, path: Path) -> None:
+    """Writes `.nii` or `.nii.gz` with an sform.
+
+    NIfTI-1, whose affine is float32; NIfTI-2 where float32 would change the affine or an axis is longer than 32767.
+    float16 and bfloat16, which the format lacks, become float32.
+    """
+    nibabel = require_nibabel(path)
+    array = storable(path, volume, _WRITTEN)
+    affine = volume.affine
+    fits = max(volume.size) <= 32767 and np.array_equal(affine.astype(np.float32).astype(np.float64), affine)
+    header = nibabel.Nifti1Header() if fits else nibabel.Nifti2Header()
+    header.set_data_shape(volume.size)
+    header.set_data_dtype(array.dtype)
+    header.set_zooms(volume.spacing)
+    header.set_sform(affine, code="aligned")
+    header["magic"] = b"n+1" if fits else b"n+2\0\r\n\x1a\n"
+    header["vox_offset"] = HEADER_BYTES[348 if fits else 540]
+    front = io.BytesIO()
+    header.write_to(front)
+    start = front.getvalue().ljust(int(header["vox_offset"]), b"\0")
+    with path.open("wb") as file, ExitStack() as stack:
+        stream = file
+        if path.name.lower().endswith(".gz"):
+            stream = stack.enter_context(gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0))
+        stream.write(start)
+        for plane in array:
+            stream.write(plane.data)

@@ -1,0 +1,281 @@
+"""NRRD volumes (`.nrrd`, or `.nhdr` with a data file beside it).
+
+Read: raw, gzip and bzip2 data, attached or in one data file in the same folder or below; both byte orders; geometry
+from `space directions` and `space origin`, or `spacings` (with `axis mins`). Written: attached gzip data.
+
+World frame: where the file declares an anatomical space (RAS, LAS, LPS), world coordinates are RAS, as in NIfTI: x to
+the right, y to the front, z to the head of the patient; LPS and LAS are converted. Other spaces are taken as they are.
+What is written always declares `right-anterior-superior`, so that a NIfTI volume keeps its place.
+
+Source: the format's definition, https://teem.sourceforge.net/nrrd/format.html
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from filterlab.io.bounded import (
+    MAX_HEADER_BYTES,
+    Stored,
+    VolumeFileError,
+    VolumeHeader,
+    as_tensor,
+    beside,
+    check_geometry,
+    check_size,
+    integer,
+    number,
+    sample_dtype,
+    storable,
+)
+from filterlab.volume import Volume
+
+_TYPES = {
+    "int8": ("signed char", "int8", "int8_t"),
+    "uint8": ("uchar", "unsigned char", "uint8", "uint8_t"),
+    "int16": ("short", "short int", "signed short", "signed short int", "int16", "int16_t"),
+    "uint16": ("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"),
+    "int32": ("int", "signed int", "int32", "int32_t"),
+    "uint32": ("uint", "unsigned int", "uint32", "uint32_t"),
+    "int64": (
+        *("longlong", "long long", "long long int", "signed long long", "signed long long int"),
+        *("int64", "int64_t"),
+    ),
+    "float32": ("float",),
+    "float64": ("double",),
+}
+TYPES = {alias: name for name, aliases in _TYPES.items() for alias in aliases}
+_WRITTEN = {name: aliases[-1] for name, aliases in _TYPES.items()}
+ENCODINGS = {"raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2"}
+
+# Anatomical space -> the signs that turn its axes into right, anterior, superior.
+SPACES = {
+    "right-anterior-superior": (1.0, 1.0, 1.0),
+    "left-anterior-superior": (-1.0, 1.0, 1.0),
+    "left-posterior-superior": (-1.0, -1.0, 1.0),
+}
+_SHORT = {"ras": "right-anterior-superior", "las": "left-anterior-superior", "lps": "left-posterior-superior"}
+_PLAIN = ("scanner-xyz", "3d-right-handed", "3d-left-handed")
+_ALIASES = {"datafile": "data file", "byteskip": "byte skip", "lineskip": "line skip", "axismins": "axis mins"}
+_ALIASES |= {"axismaxs": "axis maxs", "centers": "centerings", "blocksize": "block size"}
+
+
+def read_header(path: Path) -> VolumeHeader:
+    """The checked header of an NRRD file. Raises VolumeFileError."""
+    with path.open("rb") as file:
+        fields = _fields(path, file)
+        end = file.tell()
+    dimension = integer(path, "dimension", _required(path, fields, "dimension"))
+    if not 1 <= dimension <= 16:
+        raise VolumeFileError(path, "a dimension from 1 to 16", dimension)
+    sizes = check_size(path, [integer(path, "sizes", t) for t in _items(path, fields, "sizes", dimension)])
+    axes = _spatial_axes(path, sizes)
+    size = tuple(sizes[a] for a in axes)
+    dtype = _dtype(path, fields)
+    stored = _stored(path, fields, end, size[::-1], dtype)
+    stored.check()
+    affine, world = _affine(path, fields, dimension, axes, sizes)
+    target = sample_dtype(path, dtype)
+    return VolumeHeader(
+        path,
+        "NRRD",
+        size[::-1],
+        dtype.name,
+        check_geometry(path, affine),
+        stored.encoding,
+        world,
+        {k: v for k, v in fields.items() if k not in ("sizes", "dimension", "type", "encoding")},
+        target,
+        lambda: as_tensor(stored.read(), target),
+    )
+
+
+def _fields(path: Path, file: BinaryIO) -> dict[str, str]:
+    """The `field: value` lines up to the empty line (or, detached, the end), names in lower case."""
+    magic = file.readline(16)
+    if not re.fullmatch(rb"NRRD000[1-5]\r?\n", magic):
+        raise VolumeFileError(path, "a first line NRRD0001 … NRRD0005", repr(magic))
+    fields: dict[str, str] = {}
+    while line := file.readline(MAX_HEADER_BYTES):
+        if file.tell() > MAX_HEADER_BYTES:
+            raise VolumeFileError(path, f"a header of at most {MAX_HEADER_BYTES} bytes, ended by an empty line", "more")
+        text = line.decode("latin-1").rstrip("\r\n")
+        if not text:
+            return fields
+        if text.startswith("#") or ":=" in text:
+            continue
+        name, colon, value = text.partition(": ")
+        name = _ALIASES.get(name.lower(), name.lower())
+        if not colon or name in fields:
+            raise VolumeFileError(path, "every header line to be `field: value`, once", repr(text[:80]))
+        fields[name] = value.strip()
+    if "data file" not in fields:
+        raise VolumeFileError(path, "an empty line after the header, then samples", "the end of the file")
+    return fields
+
+
+def _required(path: Path, fields: dict[str, str], name: str) -> str:
+    if name not in fields:
+        raise VolumeFileError(path, f"a header field `{name}`", f"only {', '.join(fields) or 'none'}"[:300])
+    return fields[name]
+
+
+def _items(path: Path, fields: dict[str, str], name: str, count: int) -> list[str]:
+    items = _required(path, fields, name).split()
+    if len(items) != count:
+        raise VolumeFileError(path, f"{count} values in `{name}`", f"{len(items)}: {' '.join(items)[:80]!r}")
+    return items
+
+
+def _spatial_axes(path: Path, sizes: tuple[int, ...]) -> tuple[int, int, int]:
+    """The three axes that are kept: all, or those that are left without axes of one entry (channels, time)."""
+    axes = [a for a in range(len(sizes)) if len(sizes) == 3 or sizes[a] > 1]
+    if len(axes) != 3:
+        raise VolumeFileError(path, "three axes of one value per voxel (no images, channels or time)", f"sizes {sizes}")
+    return axes[0], axes[1], axes[2]
+
+
+def _dtype(path: Path, fields: dict[str, str]) -> np.dtype:
+    name = " ".join(_required(path, fields, "type").lower().split())
+    if name not in TYPES:
+        raise VolumeFileError(path, f"a type among {', '.join(_WRITTEN.values())}", repr(name[:40]))
+    dtype = np.dtype(TYPES[name])
+    if dtype.itemsize == 1:
+        return dtype
+    endian = _required(path, fields, "endian").lower()
+    if endian not in ("little", "big"):
+        raise VolumeFileError(path, "endian: little or big", repr(endian[:40]))
+    return dtype.newbyteorder("<" if endian == "little" else ">")
+
+
+def _stored(path: Path, fields: dict[str, str], end: int, shape: tuple[int, ...], dtype: np.dtype) -> Stored:
+    encoding = ENCODINGS.get(_required(path, fields, "encoding").lower())
+    if encoding is None:
+        raise VolumeFileError(path, f"encoding {', '.join(ENCODINGS)}", repr(fields["encoding"][:40]))
+    if integer(path, "line skip", fields.get("line skip", "0")) != 0:
+        raise VolumeFileError(path, "line skip: 0", fields["line skip"])
+    file, offset = path, end
+    if "data file" in fields:
+        name = fields["data file"]
+        if name.split()[:1] == ["LIST"] or "%" in name:
+            raise VolumeFileError(path, "one data file", f"a list of files: {name[:80]!r}")
+        file, offset = beside(path, name), 0
+    skip = integer(path, "byte skip", fields.get("byte skip", "0"))
+    stored = Stored(path, file, encoding, offset, max(skip, 0), shape, dtype)
+    if skip == -1 and encoding == "raw":  # the samples end where the file ends
+        offset = max(offset, file.stat().st_size - stored.nbytes)
+        return Stored(path, file, encoding, offset, 0, shape, dtype)
+    if skip < 0:
+        raise VolumeFileError(path, "a byte skip of 0 or more (or -1 for raw data)", skip)
+    return stored
+
+
+def _affine(
+    path: Path, fields: dict[str, str], dimension: int, axes: tuple[int, int, int], sizes: tuple[int, ...]
+) -> tuple[np.ndarray, str | None]:
+    """The 4×4 voxel -> world map, and the name of the world's axes if they are anatomical."""
+    if "space" in fields and "space dimension" in fields:
+        raise VolumeFileError(path, "`space` or `space dimension`", "both")
+    affine = np.eye(4)
+    if "space directions" in fields:
+        directions = _vectors(path, fields, "space directions")
+        if len(directions) != dimension:
+            raise VolumeFileError(path, f"{dimension} space directions", len(directions))
+        for column, axis in enumerate(axes):
+            direction = directions[axis]
+            if direction is None:
+                raise VolumeFileError(path, f"a space direction for axis {axis}", "none")
+            affine[:3, column] = direction
+    else:
+        affine = _per_axis(path, fields, dimension, axes, sizes)
+    if "space origin" in fields:
+        origin = _vectors(path, fields, "space origin")
+        if len(origin) != 1 or origin[0] is None:
+            raise VolumeFileError(path, "one vector as space origin", repr(fields["space origin"][:80]))
+        affine[:3, 3] = origin[0]
+    return _to_ras(path, fields, affine)
+
+
+def _to_ras(path: Path, fields: dict[str, str], affine: np.ndarray) -> tuple[np.ndarray, str | None]:
+    if "space" not in fields:
+        if integer(path, "space dimension", fields.get("space dimension", "3")) != 3:
+            raise VolumeFileError(path, "space dimension: 3", fields["space dimension"])
+        return affine, None
+    space = fields["space"].lower()
+    space = _SHORT.get(space, space)
+    if space in SPACES:
+        return np.diag([*SPACES[space], 1.0]) @ affine, "RAS"
+    if space not in _PLAIN:
+        raise VolumeFileError(path, f"a space among {', '.join((*SPACES, *_PLAIN))}", repr(fields["space"][:40]))
+    return affine, None
+
+
+def _vectors(path: Path, fields: dict[str, str], name: str) -> list[list[float] | None]:
+    """`(1,0,0) none (0,1,0)` as lists of three numbers; None for none."""
+    text = fields[name]
+    if not re.fullmatch(r"\s*((\([^()]*\)|none)\s*)+", text):
+        raise VolumeFileError(path, f"vectors (a,b,c) in `{name}`", repr(text[:80]))
+    vectors: list[list[float] | None] = []
+    for item in re.findall(r"\([^()]*\)|none", text):
+        parts = item.strip("()").split(",")
+        if item != "none" and len(parts) != 3:
+            raise VolumeFileError(path, f"vectors of three numbers in `{name}`", repr(item[:80]))
+        vectors.append(None if item == "none" else [number(path, name, p.strip()) for p in parts])
+    return vectors
+
+
+def _per_axis(
+    path: Path, fields: dict[str, str], dimension: int, axes: tuple[int, int, int], sizes: tuple[int, ...]
+) -> np.ndarray:
+    """From spacings and axis mins (or axis mins and maxs); a cell-centred axis begins half a voxel after its min."""
+
+    def values(name: str) -> dict[int, float]:
+        if name not in fields:
+            return {}
+        items = _items(path, fields, name, dimension)
+        return {a: number(path, name, items[a]) for a in axes if items[a].lower() != "nan" or name == "spacings"}
+
+    mins, maxs, spacings = values("axis mins"), values("axis maxs"), values("spacings")
+    centerings = _items(path, fields, "centerings", dimension) if "centerings" in fields else ["cell"] * dimension
+    affine = np.eye(4)
+    for column, axis in enumerate(axes):
+        node = centerings[axis].lower() == "node"
+        if axis in spacings:
+            spacing = spacings[axis]
+        elif axis in mins and axis in maxs:
+            spacing = (maxs[axis] - mins[axis]) / max(sizes[axis] - node, 1)
+        else:
+            spacing = 1.0
+        affine[column, column] = spacing
+        affine[column, 3] = mins[axis] + (0.0 if node else 0.5 * spacing) if axis in mins else 0.0
+    return affine
+
+
+def write(volume: Volume, path: Path) -> None:
+    """Writes one attached NRRD file, gzip. float16 and bfloat16, which the format lacks, become float32."""
+    array = storable(path, volume, tuple(_WRITTEN))
+    affine = volume.affine
+    vectors = ["(" + ",".join(repr(float(v)) for v in column) + ")" for column in affine[:3].T]
+    lines = [
+        "NRRD0005",
+        "# https://teem.sourceforge.net/nrrd/format.html",
+        f"type: {_WRITTEN[array.dtype.name]}",
+        "dimension: 3",
+        "space: right-anterior-superior",
+        f"sizes: {' '.join(map(str, volume.size))}",
+        f"space directions: {' '.join(vectors[:3])}",
+        "kinds: domain domain domain",
+        f"endian: {'little' if np.little_endian else 'big'}",
+        "encoding: gzip",
+        f"space origin: {vectors[3]}",
+    ]
+    with path.open("wb") as file:
+        file.write(("\n".join(lines) + "\n\n").encode("ascii"))
+        with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:
+            for plane in array:
+                stream.write(plane.data)

@@ -1,0 +1,250 @@
+"""NumPy volumes: `.npy`, and `.npz` with geometry.
+
+The array is (D, H, W), x along the last axis, or (N, C, D, H, W). Objects are never unpickled.
+
+* `.npz` holds `samples` (or one single array of three or five axes) and optionally `affine` (4×4), or `spacing` and
+  `origin` (x, y, z).
+* `.npy` holds samples only; geometry, where there is any, stands in a small file `NAME.npy.yaml` beside it, with the
+  keys size, affine (4×4).
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from filterlab.io.atomic import atomic_write
+from filterlab.io.bounded import (
+    EXPANSION,
+    Stored,
+    VolumeFileError,
+    VolumeHeader,
+    as_tensor,
+    check_geometry,
+    check_size,
+    native,
+    read_exactly,
+    regular_file,
+    sample_dtype,
+    scaled,
+)
+from filterlab.io.config import ConfigError, StrictModel, dump_config, load_config
+from filterlab.volume import Volume
+
+Count = Annotated[int, Field(ge=1)]
+Row = tuple[float, float, float, float]
+_GEOMETRY = ("affine", "spacing", "origin")
+_SUFFIX = ".npy"
+MAX_NPY_HEADER = 2**16
+
+
+class GeometrySidecar(StrictModel):
+    """`NAME.npy.yaml`: where the samples of `NAME.npy` lie."""
+
+    size: tuple[Count, Count, Count]
+    affine: tuple[Row, Row, Row, Row]
+
+
+def sidecar_of(path: Path) -> Path:
+    return path.with_name(path.name + ".yaml")
+
+
+def _array_header(path: Path, stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """(shape, fortran order, dtype) of the array that begins at the stream's position."""
+    start = stream.read(8)
+    version = tuple(start[6:])
+    if not start.startswith(b"\x93NUMPY") or version not in ((1, 0), (2, 0)):
+        raise VolumeFileError(path, "a valid npy header, version 1.0 or 2.0", f"{start!r}")
+    length = stream.read(2 * version[0])
+    count = int.from_bytes(length, "little")
+    if count > MAX_NPY_HEADER:
+        raise VolumeFileError(path, f"a valid npy header of at most {MAX_NPY_HEADER} bytes", count)
+    header = io.BytesIO(length + stream.read(count))
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            shape, fortran, dtype = read(header)
+    except Exception as error:  # NumPy evaluates the header as a Python literal; damaged ones fail in many ways
+        raise VolumeFileError(path, "a valid npy header", f"{type(error).__name__}: {error}"[:200]) from None
+    if any(isinstance(n, bool) for n in shape):
+        raise VolumeFileError(path, "integers as shape", shape)
+    return shape, fortran, dtype
+
+
+def _check_shape(path: Path, shape: tuple[int, ...]) -> tuple[int, ...]:
+    if len(shape) not in (3, 5):
+        raise VolumeFileError(path, "an array (D, H, W) or (N, C, D, H, W)", f"shape {shape}"[:100])
+    return check_size(path, shape)
+
+
+def _stored_order(shape: tuple[int, ...], fortran: bool) -> tuple[int, ...]:
+    return shape[::-1] if fortran else shape
+
+
+def read_npy_header(path: Path) -> VolumeHeader:
+    """The checked header of an .npy file (and of its sidecar). Raises VolumeFileError."""
+    with path.open("rb") as file:
+        shape, fortran, dtype = _array_header(path, file)
+        offset = file.tell()
+    shape, target = _check_shape(path, shape), sample_dtype(path, dtype)
+    stored = Stored(path, path, "raw", offset, 0, _stored_order(shape, fortran), dtype)
+    stored.check()
+    affine = _sidecar_affine(path, shape)
+
+    def read() -> Tensor:
+        array = stored.read()
+        return as_tensor(array.T if fortran else array, target)
+
+    fields = {"order": "Fortran"} if fortran else {}
+    geometry = check_geometry(path, affine)
+    return VolumeHeader(path, "npy", shape, dtype.name, geometry, "raw", None, fields, target, read)
+
+
+def _sidecar_affine(path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    sidecar = sidecar_of(path)
+    if not sidecar.exists():
+        return np.eye(4)
+    try:
+        found = load_config(regular_file(sidecar), GeometrySidecar)
+    except ConfigError as error:
+        raise VolumeFileError(sidecar, "the geometry of the samples", str(error)) from None
+    if found.size[::-1] != shape[-3:]:
+        raise VolumeFileError(sidecar, f"size {list(shape[:-4:-1])} as in {path.name}", f"size {list(found.size)}")
+    return np.array(found.affine)
+
+
+# --- npz --------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _archive(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]]:
+    """The archive and its arrays by name; damage anywhere in it becomes VolumeFileError."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            yield archive, {i.filename.removesuffix(_SUFFIX): i for i in archive.infolist()}
+    except VolumeFileError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError, ValueError, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in (None, 22):  # 22: a seek to where no file can be
+            raise
+        raise VolumeFileError(path, "an intact npz archive", f"{type(error).__name__}: {error}"[:200]) from None
+
+
+def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> BinaryIO:
+    """An open member whose claimed sizes are plausible."""
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise VolumeFileError(path, f"{info.filename} stored or deflated", f"zip method {info.compress_type}")
+    factor = EXPANSION["gzip"] if info.compress_type == zipfile.ZIP_DEFLATED else 1
+    present = min(info.compress_size, path.stat().st_size)
+    if info.file_size > factor * present:
+        raise VolumeFileError(
+            path, f"{info.file_size} bytes in {info.filename}", f"{present} bytes, which cannot hold that many"
+        )
+    return archive.open(info)  # type: ignore[return-value]
+
+
+def read_npz_header(path: Path) -> VolumeHeader:
+    """The checked header of an .npz file. Raises VolumeFileError."""
+    with _archive(path) as (archive, members):
+        name = _samples_name(path, members)
+        info = members[name]
+        with _member(path, archive, info) as stream:
+            shape, fortran, dtype = _array_header(path, stream)
+            offset = stream.tell()
+        shape, target = _check_shape(path, shape), sample_dtype(path, dtype)
+        claimed = math.prod(shape) * dtype.itemsize
+        if info.file_size - offset != claimed:
+            expected = f"{claimed} bytes of samples for {shape} {dtype.name} in {info.filename}"
+            raise VolumeFileError(path, expected, f"{info.file_size - offset}")
+        affine = _npz_affine(path, archive, members)
+
+    def read() -> Tensor:
+        with _archive(path) as (archive, _), _member(path, archive, info) as stream:
+            stream.read(offset)
+            buffer = read_exactly(path, stream, claimed, exact_length=False)
+            array = native(buffer, dtype, _stored_order(shape, fortran))
+        return as_tensor(array.T if fortran else array, target)
+
+    encoding = "deflate" if info.compress_type == zipfile.ZIP_DEFLATED else "raw"
+    fields = {"array": name} | ({"order": "Fortran"} if fortran else {})
+    return VolumeHeader(
+        path, "npz", shape, dtype.name, check_geometry(path, affine), encoding, None, fields, target, read
+    )
+
+
+def _samples_name(path: Path, members: dict[str, Any]) -> str:
+    others = [name for name in members if name not in _GEOMETRY]
+    if "samples" in members:
+        return "samples"
+    if len(others) != 1:
+        raise VolumeFileError(path, "an array named samples, or one array only", f"{', '.join(others) or 'none'}"[:200])
+    return others[0]
+
+
+def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]) -> np.ndarray:
+    def small(name: str, shape: tuple[int, ...], default: np.ndarray) -> np.ndarray:
+        if name not in members:
+            return default
+        with _member(path, archive, members[name]) as stream:
+            found, fortran, dtype = _array_header(path, stream)
+            if found != shape or dtype.kind not in "fiu" or dtype.itemsize > 8:
+                raise VolumeFileError(path, f"numbers of shape {shape} as {name}", f"{dtype} of shape {found}"[:100])
+            buffer = read_exactly(path, stream, math.prod(shape) * dtype.itemsize, exact_length=False)
+        array = native(buffer, dtype, _stored_order(shape, fortran)).astype(np.float64)
+        return array.T if fortran else array
+
+    if "affine" in members:
+        if "spacing" in members or "origin" in members:
+            raise VolumeFileError(path, "an affine, or spacing and origin", "both")
+        return small("affine", (4, 4), np.eye(4))
+    spacing = small("spacing", (3,), np.ones(3))
+    if not (spacing > 0).all():
+        raise VolumeFileError(path, "a positive spacing", spacing.tolist())
+    return scaled(spacing.tolist(), small("origin", (3,), np.zeros(3)).tolist())
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def _array(volume: Volume) -> np.ndarray:
+    samples = volume.samples.detach().cpu().contiguous()
+    return (samples.float() if samples.dtype == torch.bfloat16 else samples).numpy()
+
+
+def write_npy(volume: Volume, path: Path) -> None:
+    """Writes the samples; bfloat16 becomes float32. The geometry is written by `write_sidecar`."""
+    with path.open("wb") as file:
+        np.lib.format.write_array(file, _array(volume), allow_pickle=False)
+
+
+def write_sidecar(volume: Volume, path: Path) -> None:
+    """Writes `path`.yaml for a volume with geometry; removes one that is there for a volume without."""
+    sidecar = sidecar_of(path)
+    if volume.geometry.is_identity:
+        sidecar.unlink(missing_ok=True)
+        return
+    affine = tuple(map(tuple, volume.affine.tolist()))
+    found = GeometrySidecar(size=volume.size, affine=affine)  # type: ignore[arg-type]
+    with atomic_write(sidecar) as temporary:
+        temporary.write_text(dump_config(found), encoding="utf-8")
+
+
+def write_npz(volume: Volume, path: Path) -> None:
+    """Writes `samples` and `affine`, compressed; bfloat16 becomes float32."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+        for name, data in (("samples", _array(volume)), ("affine", volume.affine)):
+            with archive.open(name + _SUFFIX, "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, np.ascontiguousarray(data), allow_pickle=False)

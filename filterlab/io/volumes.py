@@ -1,0 +1,136 @@
+"""Volume files: `load_volume`, `save_volume`, `describe`; which formats there are is `FORMATS`.
+
+Samples become torch tensors (D, H, W), x along W, in native byte order, contiguous and writable. Types: int8, int16,
+int32, int64, uint8, float16, float32, float64 as stored; bool -> uint8, uint16 -> int32, uint32 -> int64. uint64 and
+complex numbers are refused, and so are images, several channels and time series (`.npy` and `.npz` may hold
+(N, C, D, H, W); axes of one entry are dropped from NRRD and NIfTI).
+
+Geometry is the 4×4 affine from voxel (x, y, z) to world. NIfTI is in RAS (x right, y anterior, z superior, mm); NRRD
+files that declare an anatomical space are converted to RAS; everything else is taken as it is. A round trip through any
+format that is written keeps the affine bit for bit.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from filterlab.io import nifti, nrrd, numpy_files, raw, tiff
+from filterlab.io.atomic import atomic_write
+from filterlab.io.bounded import VolumeFileError, VolumeHeader, regular_file
+from filterlab.io.config import unknown_name
+from filterlab.volume import Volume
+
+Writer = Callable[[Volume, Path], None]
+
+
+@dataclass(frozen=True)
+class VolumeFormat:
+    """A volume format: endings of its files, how its header is read, how a volume is written (None: read only)."""
+
+    name: str
+    endings: tuple[str, ...]
+    read_header: Callable[[Path], VolumeHeader]
+    write: Writer | None = None
+    written: tuple[str, ...] = ()
+
+
+FORMATS: dict[str, VolumeFormat] = {
+    known.name: known
+    for known in (
+        VolumeFormat("NRRD", (".nrrd", ".nhdr"), nrrd.read_header, nrrd.write, (".nrrd",)),
+        VolumeFormat("NIfTI", (".nii", ".nii.gz"), nifti.read_header, nifti.write, (".nii", ".nii.gz")),
+        VolumeFormat("TIFF", tiff.SUFFIXES, tiff.read_header),
+        VolumeFormat("npy", (".npy",), numpy_files.read_npy_header, numpy_files.write_npy, (".npy",)),
+        VolumeFormat("npz", (".npz",), numpy_files.read_npz_header, numpy_files.write_npz, (".npz",)),
+        VolumeFormat("raw", (".raw", ".raw.yaml"), raw.read_header),
+    )
+}
+
+
+BATCHED = ("npy", "npz")  # formats that hold (N, C, D, H, W)
+
+
+def format_of(path: Path) -> VolumeFormat:
+    """The format of a file by its ending; a folder is a TIFF stack. Raises VolumeFileError that lists the endings."""
+    if path.is_dir():
+        return FORMATS["TIFF"]
+    name = path.name.lower()
+    for known in FORMATS.values():
+        if name.endswith(known.endings):
+            return known
+    endings = [e for f in FORMATS.values() for e in f.endings]
+    raise VolumeFileError(path, "a volume file", unknown_name("ending", path.suffix, endings))
+
+
+def check_saveable(path: str | os.PathLike[str], *, batched: bool = False) -> Path:
+    """The path, once it is known that a volume can be written under such a name; for calls before long work.
+
+    Raises:
+        VolumeFileError: an ending that is not written (lists those that are), a batch (N, C, …) in a format that holds
+            (D, H, W) only, or a missing package.
+    """
+    path = Path(path)
+    endings = [e for f in FORMATS.values() for e in f.written]
+    if not path.name.lower().endswith(tuple(endings)):
+        raise VolumeFileError(path, f"a name that ends in {', '.join(endings)}", repr(path.suffix))
+    name = format_of(path).name
+    if batched and name not in BATCHED:
+        raise VolumeFileError(path, f"{' or '.join(BATCHED)} for samples (N, C, D, H, W)", name)
+    if name == "NIfTI":
+        nifti.require_nibabel(path)
+    return path
+
+
+def describe(path: str | os.PathLike[str]) -> VolumeHeader:
+    """The checked header of a volume file, without its voxels.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        VolumeFileError: no known format, or a header that cannot be true of this file.
+    """
+    path = Path(path)
+    known = format_of(path)
+    if not path.is_dir():
+        regular_file(path)
+    return known.read_header(path)
+
+
+def load_volume(path: str | os.PathLike[str], *, max_bytes: int = 2**33) -> Volume:
+    """The volume in a file (or in a folder of TIFF slices).
+
+    Args:
+        path: NRRD, NIfTI, TIFF, .npy, .npz, or .raw with a sidecar (`FORMATS`).
+        max_bytes: the most that the samples may take in memory; default 8 GiB.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        VolumeFileError: an unknown format, a damaged file, or a header that promises what the file cannot hold; raised
+            before anything of the claimed size is allocated.
+    """
+    header = describe(path)
+    return Volume.with_geometry(header.read(max_bytes), header.geometry)
+
+
+def save_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
+    """Writes a volume: `.nrrd` (gzip), `.nii`, `.nii.gz`, `.npy` (geometry in NAME.npy.yaml), `.npz`.
+
+    The file appears whole or not at all. A round trip keeps samples and affine bit for bit; float16 (in NRRD, NIfTI)
+    and bfloat16 come back as float32. Gradients are not saved.
+
+    Raises:
+        VolumeFileError: an ending that is not written, or a type or batch (N, C, …) that the format cannot hold.
+        OSError: the folder is missing or not writable.
+    """
+    path = check_saveable(path, batched=volume.batched)
+    write = format_of(path).write
+    assert write is not None
+    with atomic_write(path) as temporary:
+        try:
+            write(volume, temporary)
+        except VolumeFileError as error:  # name the file that was asked for, not the temporary one
+            raise VolumeFileError(path, error.expected, error.got) from None
+        if path.name.lower().endswith(".npy"):
+            numpy_files.write_sidecar(volume, path)

@@ -1,0 +1,78 @@
+"""A file appears whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from filterlab.io.atomic import atomic_write, check_writable
+
+
+def test_writes_and_leaves_nothing_else(tmp_path: Path) -> None:
+    with atomic_write(tmp_path / "a.nii.gz") as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.name.endswith(".nii.gz")
+        temporary.write_text("new")
+    assert (tmp_path / "a.nii.gz").read_text() == "new"
+    assert os.listdir(tmp_path) == ["a.nii.gz"]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_an_error_keeps_the_old_file(tmp_path: Path, error: type[BaseException]) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def fail() -> None:
+        with atomic_write(path) as temporary:
+            temporary.write_text("half")
+            raise error
+
+    with pytest.raises(error):
+        fail()
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_the_old_file_is_there_until_the_end(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with atomic_write(path) as temporary:
+        temporary.write_text("new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+
+
+def test_a_link_stays_a_link(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    target, link = tmp_path / "there" / "a.txt", tmp_path / "link.txt"
+    target.write_text("old")
+    link.symlink_to(target)
+    with atomic_write(link) as temporary:
+        temporary.write_text("new")
+    assert link.is_symlink()
+    assert target.read_text() == "new"
+
+
+def test_an_impossible_place_is_found_before_the_block_runs(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path, error in (
+        (tmp_path / "missing" / "a.txt", FileNotFoundError),
+        (tmp_path / "file" / "a.txt", NotADirectoryError),
+        (tmp_path, IsADirectoryError),
+    ):
+        with pytest.raises(error, match="expected"):
+            check_writable(path)
+        with pytest.raises(error), atomic_write(path):
+            pytest.fail("the block must not run")
+
+
+def test_a_read_only_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "locked"
+    folder.mkdir()
+    folder.chmod(0o500)
+    if os.access(folder, os.W_OK):
+        pytest.skip("this user may write everywhere (root)")
+    with pytest.raises(PermissionError, match="writable"):
+        check_writable(folder / "a.txt")

@@ -1,0 +1,647 @@
+"""Files that lie: a VolumeFileError that names the file, what was expected and what came, before memory is spent."""
+
+from __future__ import annotations
+
+import bz2
+import contextlib
+import gzip
+import io
+import os
+import struct
+import tracemalloc
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from filterlab.io import VolumeFileError, load_volume
+from filterlab.volume import Volume
+from tests.io.writers import ENDINGS, SAMPLES, write_any, write_nifti, write_npy, write_npz, write_nrrd, write_raw
+
+MEMORY = 24 * 2**20  # far below every claim made here
+
+
+def refused(path: Path, *words: str, action: Callable[[Path], object] = load_volume) -> None:
+    """load_volume refuses the file with all these words in the message, and allocates little on the way."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(VolumeFileError) as caught:
+            action(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    message = str(caught.value)
+    assert str(path.parent) in message
+    assert "expected" in message
+    assert "; got " in message
+    for word in words:
+        assert word in message, message
+    assert peak < MEMORY, f"{peak} bytes were allocated"
+
+
+# --- NRRD -------------------------------------------------------------------------------------------------------------
+
+MINIMAL = {"type": "uint8", "dimension": "3", "sizes": "4 3 2", "encoding": "raw"}
+
+
+def nrrd_file(path: Path, data: bytes = bytes(24), drop: str = "", **fields: str) -> Path:
+    entries = MINIMAL | {k.replace("_", " "): v for k, v in fields.items()}
+    header = "".join(f"{k}: {v}\n" for k, v in entries.items() if k != drop)
+    path.write_bytes(b"NRRD0004\n" + header.encode("latin-1") + b"\n" + data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"sizes": "4 3 3"}, ["36 bytes", "got 24 bytes"]),
+        ({"sizes": "4 3 1"}, ["12 bytes", "got 24 bytes"]),
+        ({"sizes": "40000 40000 40000"}, ["64000000000000 bytes"]),
+        ({"sizes": "2147483647 2147483647 2147483647"}, ["bytes of samples"]),
+        ({"sizes": "4294967296 4294967296 1"}, ["sizes from 1"]),
+        ({"sizes": "9" * 30 + " 1 1"}, ["an integer of at most 18 digits for sizes"]),
+        ({"sizes": "-4 -3 2"}, ["sizes from 1"]),
+        ({"sizes": "0 3 2"}, ["sizes from 1"]),
+        ({"sizes": "4 3"}, ["3 values in `sizes`"]),
+        ({"sizes": "4 3 two"}, ["an integer", "'two'"]),
+        ({"sizes": "4.0 3 2"}, ["an integer", "'4.0'"]),
+        ({"sizes": "1_2 1 2"}, ["an integer"]),
+        ({"dimension": "2", "sizes": "6 4"}, ["three axes", "(6, 4)"]),
+        ({"dimension": "4", "sizes": "3 2 2 2"}, ["three axes"]),
+        ({"dimension": "99"}, ["from 1 to 16"]),
+        ({"dimension": "-3"}, ["from 1 to 16"]),
+        ({"dimension": "three"}, ["an integer", "dimension"]),
+        ({"type": "block"}, ["a type among", "'block'"]),
+        ({"type": "uint64"}, ["a type among", "'uint64'"]),
+        ({"type": "int16", "sizes": "2 3 2"}, ["`endian`"]),
+        ({"type": "int16", "sizes": "2 3 2", "endian": "middle"}, ["little or big"]),
+        ({"encoding": "ascii"}, ["encoding raw, gzip"]),
+        ({"encoding": "gzip", "sizes": "1000000 1000000 1000"}, ["cannot hold that many"]),
+        ({"encoding": "bzip2", "sizes": "1000000 1000000 1000"}, ["cannot hold that many"]),
+        ({"spacings": "1 1 nan"}, ["a finite number for spacings"]),
+        ({"spacings": "1 1 inf"}, ["a finite number"]),
+        ({"spacings": "1 1 1e999"}, ["a finite number"]),
+        ({"spacings": "1 1 0"}, ["invertible"]),
+        ({"spacings": "1 1"}, ["3 values"]),
+        ({"spacings": "1e-300 1e300 1"}, ["finite numbers"]),
+        ({"space": "LPS", "space_directions": "(1,0,0) (2,0,0) (0,0,1)"}, ["invertible"]),
+        ({"space": "LPS", "space_directions": "(1,0,0) (0,1,0)"}, ["3 space directions"]),
+        ({"space": "LPS", "space_directions": "(1,0,0) (0,1,0) none"}, ["a space direction for axis 2"]),
+        ({"space": "LPS", "space_directions": "(1,0) (0,1) (0,0)"}, ["three numbers"]),
+        ({"space": "LPS", "space_directions": "(1,0,0) (0,1,0) (0,0,nan)"}, ["a finite number"]),
+        ({"space": "LPS", "space_directions": "1 0 0 0 1 0 0 0 1"}, ["vectors (a,b,c)"]),
+        ({"space": "LPS", "space_origin": "(1,2)"}, ["three numbers"]),
+        ({"space": "LPS", "space_origin": "none"}, ["one vector"]),
+        ({"space": "outer"}, ["a space among"]),
+        ({"space_dimension": "4"}, ["space dimension: 3"]),
+        ({"byte_skip": "5"}, ["29 bytes"]),
+        ({"byte_skip": "-1", "sizes": "4 3 9"}, ["108 bytes"]),
+        ({"byte_skip": "-2"}, ["byte skip"]),
+        ({"byte_skip": "999999999999999999"}, ["got 24 bytes"]),
+        ({"line_skip": "1"}, ["line skip: 0"]),
+        ({"data_file": "/etc/passwd"}, ["same folder or below", "'/etc/passwd'"]),
+        ({"data_file": "../secret.raw"}, ["same folder or below"]),
+        ({"data_file": "sub/../../secret.raw"}, ["same folder or below"]),
+        ({"data_file": "sub/../near.raw"}, ["same folder or below"]),
+        ({"data_file": "link.raw"}, ["a link to a place outside"]),
+        ({"data_file": "linked/secret.raw"}, ["a link to a place outside"]),
+        ({"data_file": "missing.raw"}, ["no file"]),
+        ({"data_file": "x" * 5000}, ["same folder or below"]),
+        ({"data_file": "."}, ["no file"]),
+        ({"data_file": "LIST"}, ["one data file"]),
+        ({"data_file": "a%03d.raw 1 9 1"}, ["one data file"]),
+    ],
+)
+def test_nrrd_headers_that_lie(tmp_path: Path, fields: dict[str, str], words: list[str]) -> None:
+    folder = tmp_path / "inside"
+    (folder / "sub").mkdir(parents=True)
+    (tmp_path / "secret.raw").write_bytes(bytes(24))
+    (folder / "near.raw").write_bytes(bytes(24))
+    (folder / "link.raw").symlink_to(tmp_path / "secret.raw")
+    (folder / "linked").symlink_to(tmp_path)
+    refused(nrrd_file(folder / "a.nrrd", **fields), *words)
+
+
+@pytest.mark.parametrize("field", ["type", "dimension", "sizes", "encoding"])
+def test_nrrd_missing_fields(tmp_path: Path, field: str) -> None:
+    refused(nrrd_file(tmp_path / "a.nrrd", drop=field), f"`{field}`")
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        (b"", "NRRD0001"),
+        (b"NRRD0009\n", "NRRD0001"),
+        (b"NRRD0004\n", "an empty line"),
+        (b"NRRD0004\ntype: uint8\ntype: int8\n\n", "once"),
+        (b"NRRD0004\nnonsense\n\n", "field: value"),
+        (b"NRRD0004\n" + b"#" * 4 * 2**20, "at most 1048576 bytes"),
+        (b"NRRD0004\n" + (b"#" * 1000 + b"\n") * 2**11, "at most 1048576 bytes"),
+        (b"NRRD0004\n" + bytes(range(128, 256)) + b"\n\n", "field: value"),
+    ],
+)
+def test_nrrd_headers_that_are_none(tmp_path: Path, content: bytes, word: str) -> None:
+    path = tmp_path / "a.nrrd"
+    path.write_bytes(content)
+    refused(path, word)
+
+
+def test_a_link_inside_the_folder_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "real.raw").write_bytes(bytes(24))
+    (tmp_path / "link.raw").symlink_to(tmp_path / "real.raw")
+    assert load_volume(nrrd_file(tmp_path / "a.nhdr", b"", data_file="link.raw")).size == (4, 3, 2)
+
+
+@pytest.mark.parametrize(
+    ("data", "word"),
+    [
+        (gzip.compress(bytes(23)), "after 23"),
+        (gzip.compress(bytes(25)), "more than that"),
+        (gzip.compress(bytes(24)) * 2, "more than that"),
+        (gzip.compress(bytes(2**26), 9), "more than that"),  # 64 MiB from 64 kB
+        (gzip.compress(bytes(24))[:-9], "damaged or truncated"),
+        (gzip.compress(bytes(24))[:-4] + bytes(4), "damaged or truncated"),
+        (gzip.compress(bytes(24)) + b"junk", "damaged or truncated"),
+        (b"no gzip at all, but long enough", "damaged or truncated"),
+        (gzip.compress(bytes(24))[:12] + b"\xff" * 20, "damaged or truncated"),
+    ],
+)
+def test_gzip_that_lies(tmp_path: Path, data: bytes, word: str) -> None:
+    refused(nrrd_file(tmp_path / "a.nrrd", data, encoding="gzip"), word)
+
+
+def test_gzip_claims_what_it_could_but_does_not_hold(tmp_path: Path) -> None:
+    """The claim passes the ratio (1032 : 1), so that only reading tells; memory follows what is there."""
+    data = gzip.compress(os.urandom(2**20))
+    refused(nrrd_file(tmp_path / "a.nrrd", data, encoding="gzip", sizes="1000 1000 1000"), "after 1048576")
+
+
+@pytest.mark.parametrize(
+    ("data", "word"),
+    [
+        (bz2.compress(bytes(23)), "after 23"),
+        (bz2.compress(bytes(2**26)), "more than that"),
+        (bz2.compress(bytes(24))[:-5], "damaged or truncated"),
+        (b"x" * 40, "damaged or truncated"),
+    ],
+)
+def test_bzip2_that_lies(tmp_path: Path, data: bytes, word: str) -> None:
+    refused(nrrd_file(tmp_path / "a.nrrd", data, encoding="bzip2"), word)
+
+
+# --- NIfTI ------------------------------------------------------------------------------------------------------------
+
+# offsets of fields in a NIfTI-1 header
+DIM, DATATYPE, BITPIX, VOX_OFFSET, SLOPE, INTER, SFORM_CODE, SROW, MAGIC = 40, 70, 72, 108, 112, 116, 254, 280, 344
+
+
+def nifti_file(path: Path, *patches: tuple[int, str, tuple]) -> Path:
+    """A valid NIfTI-1 file of uint8 SAMPLES with some fields of its header overwritten."""
+    plain = write_nifti(path.with_name("plain.nii"), SAMPLES.astype(np.uint8))
+    data = bytearray(plain.read_bytes())
+    for offset, layout, values in patches:
+        struct.pack_into("<" + layout, data, offset, *values)
+    path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
+    return path
+
+
+@pytest.mark.parametrize("ending", [".nii", ".nii.gz"])
+@pytest.mark.parametrize(
+    ("patch", "word"),
+    [
+        ((DIM, "4h", (3, 4, 3, 3)), "36"),
+        ((DIM, "4h", (3, 32767, 32767, 32767)), "351811509"),
+        ((DIM, "4h", (3, -4, 3, 2)), "sizes from 1"),
+        ((DIM, "4h", (3, -1, 3, 2)), "sizes from 1"),
+        ((DIM, "4h", (3, 0, 3, 2)), "sizes from 1"),
+        ((DIM, "4h", (2, 8, 3, 1)), "three axes"),
+        ((DIM, "5h", (4, 2, 2, 2, 3)), "three axes"),
+        ((DIM, "h", (0,)), "dim[0]"),
+        ((DIM, "h", (-3,)), "dim[0]"),
+        ((DIM, "h", (200,)), "dim[0]"),
+        ((DATATYPE, "h", (9999,)), "a known data type"),
+        ((DATATYPE, "hh", (32, 64)), "a type among"),  # complex
+        ((DATATYPE, "hh", (128, 24)), "a type among"),  # RGB
+        ((DATATYPE, "hh", (1280, 64)), "a type among"),  # uint64
+        ((BITPIX, "h", (16,)), "bitpix 8"),
+        ((VOX_OFFSET, "f", (0.0,)), "vox_offset"),
+        ((VOX_OFFSET, "f", (-400.0,)), "vox_offset"),
+        ((VOX_OFFSET, "f", (352.5,)), "vox_offset"),
+        ((VOX_OFFSET, "f", (float("nan"),)), "vox_offset"),
+        ((VOX_OFFSET, "f", (1e30,)), "vox_offset"),
+        ((VOX_OFFSET, "f", (1e12,)), "bytes"),
+        ((VOX_OFFSET, "f", (360.0,)), ""),
+        ((SLOPE, "ff", (float("inf"), 0.0)), "finite scl_slope"),
+        ((SLOPE, "ff", (2.0, float("nan"))), "finite scl_slope"),
+        ((SROW, "f", (float("nan"),)), "affine"),
+        ((SROW, "12f", (0.0,) * 12), "invertible"),
+        ((MAGIC, "4s", (b"ni1\0",)), "a single NIfTI file"),
+        ((0, "i", (349,)), "a NIfTI header"),
+    ],
+)
+def test_nifti_headers_that_lie(tmp_path: Path, ending: str, patch: tuple, word: str) -> None:
+    refused(nifti_file(tmp_path / f"a{ending}", patch), word)
+
+
+def test_the_patched_nifti_is_valid_unpatched(tmp_path: Path) -> None:
+    for ending in (".nii", ".nii.gz"):
+        assert load_volume(nifti_file(tmp_path / f"a{ending}")).size == (4, 3, 2)
+
+
+def test_nifti_truncated_and_endless(tmp_path: Path) -> None:
+    whole = nifti_file(tmp_path / "a.nii").read_bytes()
+    for content, word in (
+        (whole[:-1], "24 bytes"),
+        (whole + b"1", "got 25 bytes"),
+        (whole[:300], "header"),
+        (b"", "header"),
+    ):
+        (tmp_path / "b.nii").write_bytes(content)
+        refused(tmp_path / "b.nii", word)
+    packed = gzip.compress(whole)
+    for content, word in (
+        (packed[:-1], "damaged or truncated"),
+        (gzip.compress(whole + bytes(2**26)), "more than that"),
+        (gzip.compress(whole[:-1]), "after 23"),
+        (b"", "header"),
+        (packed[:50], "damaged or truncated"),
+    ):
+        (tmp_path / "b.nii.gz").write_bytes(content)
+        refused(tmp_path / "b.nii.gz", word)
+
+
+# --- NumPy ------------------------------------------------------------------------------------------------------------
+
+
+def npy_bytes(header: str, data: bytes = bytes(24), version: bytes = b"\x01\x00") -> bytes:
+    text = header.encode("latin-1") + b"\n"
+    return b"\x93NUMPY" + version + struct.pack("<H", len(text)) + text + data
+
+
+@pytest.mark.parametrize("ending", [".npy", ".npz"])
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 5)}", ["30 bytes", "24"]),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 3)}", ["18 bytes", "24"]),
+        ("{'descr': '<f8', 'fortran_order': True, 'shape': (100000, 100000, 100000)}", ["8000000000000000 bytes"]),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (-2, -3, 4)}", ["sizes from 1"]),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (0, 3, 4)}", ["sizes from 1"]),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (4294967296, 4294967296, 1)}", ["sizes from 1"]),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (True, 3, 8)}", ["integers"]),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (24,)}", ["(D, H, W)"]),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (4, 6)}", ["(D, H, W)"]),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 2, 2)}", ["(D, H, W)"]),
+        ("{'descr': '|O', 'fortran_order': False, 'shape': (1, 1, 3)}", ["a type among"]),
+        ("{'descr': '<c8', 'fortran_order': False, 'shape': (1, 1, 3)}", ["a type among"]),
+        ("{'descr': '<u8', 'fortran_order': False, 'shape': (1, 1, 3)}", ["a type among"]),
+        ("{'descr': '|S3', 'fortran_order': False, 'shape': (2, 2, 2)}", ["a type among"]),
+        ("{'descr': [('a', '|u1')], 'fortran_order': False, 'shape': (2, 3, 4)}", ["a type among"]),
+        ("{'descr': '<M8[s]', 'fortran_order': False, 'shape': (1, 1, 3)}", ["a type among"]),
+        ("{'descr': '|u1', 'shape': (2, 3, 4)}", ["a valid npy header"]),
+        ("__import__('os').abort()", ["a valid npy header"]),
+        ("(" * 3000, ["a valid npy header"]),
+        ("{" + "1:" * 9000, ["a valid npy header"]),
+    ],
+)
+def test_npy_headers_that_lie(tmp_path: Path, ending: str, header: str, words: list[str]) -> None:
+    path = tmp_path / f"a{ending}"
+    if ending == ".npy":
+        path.write_bytes(npy_bytes(header))
+    else:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("samples.npy", npy_bytes(header))
+    refused(path, *words)
+
+
+def test_npy_objects_are_never_unpickled(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, np.array([[[print]]], dtype=object), allow_pickle=True)
+    refused(path, "a type among")
+    np.savez(tmp_path / "a.npz", samples=np.array([[[print]]], dtype=object), allow_pickle=True)
+    refused(tmp_path / "a.npz", "a type among")
+
+
+def test_npy_header_length_that_lies(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    path.write_bytes(b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b"{}")
+    refused(path, "a valid npy header")
+    path.write_bytes(b"\x93NUMPY\x07\x00")
+    refused(path, "npy")
+    path.write_bytes(b"")
+    refused(path, "a valid npy header")
+
+
+def zipped(path: Path, method: int = zipfile.ZIP_DEFLATED, **members: bytes) -> Path:
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, content in members.items():
+            archive.writestr(f"{name}.npy", content)
+    return path
+
+
+def saved(array: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+SMALL = saved(np.zeros((2, 3, 4), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("members", "words"),
+    [
+        ({"a": SMALL, "b": SMALL}, ["an array named samples", "a, b"]),
+        ({}, ["an array named samples", "none"]),
+        ({"samples": SMALL, "affine": saved(np.zeros((4, 4)))}, ["0 0 0 1"]),
+        ({"samples": SMALL, "affine": saved(np.diag([1.0, 1.0, 0.0, 1.0]))}, ["invertible"]),
+        ({"samples": SMALL, "affine": saved(np.diag([1.0, 1.0, np.nan, 1.0]))}, ["finite"]),
+        ({"samples": SMALL, "affine": saved(np.eye(3))}, ["(4, 4)"]),
+        ({"samples": SMALL, "affine": saved(np.zeros((4000, 4000)))}, ["(4, 4)"]),
+        ({"samples": SMALL, "affine": saved(np.eye(4)), "spacing": saved(np.ones(3))}, ["both"]),
+        ({"samples": SMALL, "spacing": saved(np.array([1.0, -1.0, 1.0]))}, ["positive"]),
+        ({"samples": SMALL, "spacing": saved(np.array([1.0, np.nan, 1.0]))}, ["positive"]),
+        ({"samples": SMALL, "spacing": saved(np.array(["a", "b", "c"]))}, ["numbers of shape (3,)"]),
+    ],
+)
+def test_npz_contents(tmp_path: Path, members: dict[str, bytes], words: list[str]) -> None:
+    refused(zipped(tmp_path / "a.npz", **members), *words)
+
+
+def test_zip_bombs(tmp_path: Path) -> None:
+    header = npy_bytes("{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 4)}", b"")
+    refused(zipped(tmp_path / "a.npz", samples=header + bytes(2**26)), "24 bytes")
+    refused(zipped(tmp_path / "b.npz", zipfile.ZIP_BZIP2, samples=SMALL), "stored or deflated")
+    # the directory says the member is small, its data says 64 MiB: no more than the directory's size is read
+    path = zipped(tmp_path / "c.npz", samples=header + bytes(2**26))
+    content = path.read_bytes().replace(struct.pack("<I", len(header) + 2**26), struct.pack("<I", len(header) + 24))
+    path.write_bytes(content)
+    refused(path, "intact npz archive")
+    # the directory says 2 GiB, in 200 bytes
+    path = zipped(tmp_path / "d.npz", samples=SMALL)
+    path.write_bytes(path.read_bytes().replace(struct.pack("<I", len(SMALL)), struct.pack("<I", 2**31)))
+    refused(path, "cannot hold that many")
+
+
+def test_npz_damage(tmp_path: Path) -> None:
+    whole = write_npz(tmp_path / "a.npz", SAMPLES.astype(np.uint8)).read_bytes()
+    for content in (whole[:-1], whole[:40], b"", b"PK", whole[:60] + b"\xff" * 8 + whole[68:]):
+        (tmp_path / "b.npz").write_bytes(content)
+        refused(tmp_path / "b.npz", "b.npz")
+
+
+def test_sidecars_that_lie(tmp_path: Path) -> None:
+    path = write_npy(tmp_path / "a.npy", SAMPLES.astype(np.uint8))
+    row = "[0, 0, 0, 0]"
+    for text, word in (
+        ("size: [4, 3, 2]\naffine: 5", "affine"),
+        (f"size: [4, 3, 2]\naffine: [{row}, {row}, {row}, {row}]", "last row 0 0 0 1"),
+        (f"size: [4, 3, 2]\naffine: [{row}, {row}, {row}, [0, 0, 0, 1]]", "invertible"),
+        ("size: [4, 3, 2]\nafine: 1", "did you mean 'affine'"),
+    ):
+        (tmp_path / "a.npy.yaml").write_text(text)
+        refused(path, word)
+
+
+# --- raw --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("size: [4, 3, 3]\ndtype: uint8", ["36 bytes", "24"]),
+        ("size: [4, 3, 1]\ndtype: uint8", ["12 bytes", "24"]),
+        ("size: [40000, 40000, 40000]\ndtype: float64\nbyte_order: big", ["512000000000000 bytes"]),
+        ("size: [99999999999, 1, 1]\ndtype: uint8", ["sizes from 1"]),
+        ("size: [-4, -3, 2]\ndtype: uint8", ["size[0]", "greater than or equal to 1"]),
+        ("size: [4, 6]\ndtype: uint8", ["size"]),
+        ("size: [4, 3, two]\ndtype: uint8", ["size[2]", "integer"]),
+        ("size: [4, 3, 2]\ndtype: uint7", ["unknown dtype 'uint7'; did you mean 'uint8'?"]),
+        ("size: [4, 3, 2]\ndtype: object", ["unknown dtype"]),
+        ("size: [4, 3, 1]\ndtype: int16", ["byte_order"]),
+        ("size: [4, 3, 2]\ndtype: uint8\noffset: 1", ["got 23 bytes"]),
+        ("size: [4, 3, 2]\ndtype: uint8\noffset: -1", ["offset"]),
+        ("size: [4, 3, 2]\ndtype: uint8\noffset: 4000000000000000000", ["got 0 bytes"]),
+        ("size: [4, 3, 2]\ndtype: uint8\nspacing: [1, 1, .nan]", ["finite"]),
+        ("size: [4, 3, 2]\ndtype: uint8\nspacing: [1, 1, 0]", ["greater than 0"]),
+        ("size: [4, 3, 2]\ndtype: uint8\nspacings: [1, 1, 1]", ["did you mean 'spacing'?"]),
+        ("size: [4, 3, 2]\ndtype: uint8\nfile: b.raw", ["file: a.raw", "b.raw"]),
+        ("size: [4, 3, 2]", ["dtype", "missing"]),
+        ("&x 5", ["anchors"]),
+    ],
+)
+def test_raw_sidecars_that_lie(tmp_path: Path, text: str, words: list[str]) -> None:
+    path = write_raw(tmp_path / "a.raw", SAMPLES.astype(np.uint8))
+    path.with_name("a.raw.yaml").write_text(text)
+    refused(path, *words)
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../a.raw", "link.raw", "nothing.raw", "''"])
+def test_raw_files_elsewhere(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    (tmp_path / "a.raw").write_bytes(bytes(24))
+    (folder / "link.raw").symlink_to(tmp_path / "a.raw")
+    sidecar = folder / "b.raw.yaml"
+    sidecar.write_text(f"file: {name}\nsize: [4, 3, 2]\ndtype: uint8")
+    refused(sidecar, "same folder or below")
+
+
+# --- TIFF -------------------------------------------------------------------------------------------------------------
+
+
+def tags_of(data: bytes, page: int = 0) -> dict[int, int]:
+    """Tag -> position of its entry, for a little-endian TIFF; key 0: where the next page's offset stands."""
+    at = struct.unpack_from("<I", data, 4)[0]
+    for _ in range(page):
+        at = struct.unpack_from("<I", data, at + 2 + 12 * struct.unpack_from("<H", data, at)[0])[0]
+    count = struct.unpack_from("<H", data, at)[0]
+    return {struct.unpack_from("<H", data, at + 2 + 12 * i)[0]: at + 2 + 12 * i for i in range(count)} | {
+        0: at + 2 + 12 * count
+    }
+
+
+def tiff_file(path: Path, tag: int, value: int, page: int = 0, **options: object) -> Path:
+    """A valid three-page stack with the (inline) value of one tag overwritten."""
+    tifffile.imwrite(path, np.zeros((3, 40, 50), np.uint8), photometric="minisblack", **options)
+    data = bytearray(path.read_bytes())
+    at = tags_of(data, page)[tag]
+    if tag == 0:
+        struct.pack_into("<I", data, at, value)
+    else:
+        struct.pack_into("<H" if struct.unpack_from("<H", data, at + 2)[0] == 3 else "<I", data, at + 8, value)
+    path.write_bytes(data)
+    return path
+
+
+WIDTH, LENGTH, BITS, COMPRESSION, OFFSETS, SAMPLES_PER_PIXEL, ROWS, COUNTS = 256, 257, 258, 259, 273, 277, 278, 279
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib"}])
+@pytest.mark.parametrize(
+    ("tag", "value", "page"),
+    [
+        (WIDTH, 60_000, 0),
+        (WIDTH, 0, 0),
+        (LENGTH, 60_000, 0),
+        (LENGTH, 41, 1),
+        (BITS, 16, 0),
+        (BITS, 1, 2),
+        (BITS, 7, 0),
+        (COMPRESSION, 5, 0),
+        (COMPRESSION, 7, 0),
+        (COMPRESSION, 999, 0),
+        (OFFSETS, 2**31, 0),
+        (OFFSETS, 2**31, 2),
+        (SAMPLES_PER_PIXEL, 3, 0),
+        (SAMPLES_PER_PIXEL, 0, 0),
+        (ROWS, 0, 0),
+        (ROWS, 1, 0),
+        (COUNTS, 1, 0),
+        (COUNTS, 2**31, 1),
+        (0, 8, 2),  # pages in a circle
+        (0, 2**31, 2),
+    ],
+)
+def test_tiff_headers_that_lie(tmp_path: Path, tag: int, value: int, page: int, options: dict) -> None:
+    refused(tiff_file(tmp_path / "a.tif", tag, value, page, **options))
+
+
+def test_a_long_circle_of_pages(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.zeros((300, 4, 4), np.uint8), photometric="minisblack", metadata=None)
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, tags_of(data, 299)[0], struct.unpack_from("<I", data, tags_of(data, 148)[0])[0])
+    path.write_bytes(data)
+    refused(path, "a chain of pages that ends")
+
+
+def test_tags_larger_than_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.zeros((3, 4, 4), np.uint8), photometric="minisblack")
+    data = bytearray(path.read_bytes())
+    at = tags_of(data)[270]  # ImageDescription
+    for count in (2**32 - 1, 10**6):
+        struct.pack_into("<I", data, at + 4, count)
+        path.write_bytes(data)
+        refused(path, "tag 270 within its")
+
+
+def test_a_deflate_bomb_in_a_strip(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.zeros((2, 40, 50), np.uint8), photometric="minisblack", compression="zlib")
+    data = bytearray(path.read_bytes())
+    bomb = zlib.compress(bytes(2**26), 9)
+    tags = tags_of(data)
+    struct.pack_into("<I", data, tags[OFFSETS] + 8, len(data))
+    kind = struct.unpack_from("<H", data, tags[COUNTS] + 2)[0]
+    assert kind in (3, 4)
+    struct.pack_into("<HII", data, tags[COUNTS] + 2, 4, 1, len(bomb))
+    path.write_bytes(bytes(data) + bomb)
+    refused(path, "a strip or tile of 2000 bytes", "got 1048576")  # one block, then it stops
+
+
+def test_tiff_pages_that_differ_and_images(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    with tifffile.TiffWriter(path) as writer:
+        writer.write(np.zeros((4, 4), np.uint8))
+        writer.write(np.zeros((4, 5), np.uint8))
+    refused(path, "pages of 4 × 4 uint8", "page 1 of 5 × 4 uint8")
+    with tifffile.TiffWriter(path) as writer:
+        writer.write(np.zeros((4, 4), np.uint8))
+        writer.write(np.zeros((4, 4), np.uint16))
+    refused(path, "page 1 of 4 × 4 uint16")
+    tifffile.imwrite(path, np.zeros((4, 4), np.uint8))
+    refused(path, "two or more pages")
+    tifffile.imwrite(path, np.zeros((3, 8, 8, 3), np.uint8), photometric="rgb")
+    refused(path, "one whole number or float per pixel")
+    tifffile.imwrite(path, np.zeros((3, 8, 8), np.complex64), photometric="minisblack")
+    refused(path, "a type among")
+    tifffile.imwrite(path, np.zeros((2, 3, 8, 8), np.uint8), imagej=True, metadata={"axes": "TZYX"})
+    refused(path, "one channel and one frame")
+
+
+def test_tiff_folders(tmp_path: Path) -> None:
+    refused(tmp_path, "a folder of .tif or .tiff slices")
+    tifffile.imwrite(tmp_path / "a1.tif", np.zeros((4, 4), np.uint8))
+    refused(tmp_path, "two or more pages")
+    tifffile.imwrite(tmp_path / "a2.tif", np.zeros((4, 5), np.uint8))
+    refused(tmp_path, "a2.tif", "5 × 4")
+    tifffile.imwrite(tmp_path / "a2.tif", np.zeros((3, 4, 4), np.uint8), photometric="minisblack")
+    refused(tmp_path, "one page in every slice")
+
+
+# --- any bytes at all -------------------------------------------------------------------------------------------------
+
+changes = st.lists(
+    st.one_of(
+        st.tuples(st.just("set"), st.floats(0, 1), st.binary(min_size=1, max_size=6)),
+        st.tuples(st.just("insert"), st.floats(0, 1), st.binary(min_size=1, max_size=6) | st.just(b"99999999")),
+        st.tuples(st.just("delete"), st.floats(0, 1), st.binary(min_size=1, max_size=30)),
+        st.tuples(st.just("cut"), st.floats(0, 1), st.just(b"")),
+    ),
+    min_size=1,
+    max_size=3,
+)
+
+
+def changed(content: bytes, edits: list[tuple[str, float, bytes]]) -> bytes:
+    data = bytearray(content)
+    for kind, where, patch in edits:
+        at = int(where**2 * len(data))  # more often near the front, where headers are
+        if kind == "cut":
+            del data[at:]
+        else:
+            data[at : at + (0 if kind == "insert" else len(patch))] = b"" if kind == "delete" else patch
+    return bytes(data)
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Path, bytes]]:
+    """Ending -> the volume's path, the file to damage (for detached data: the header), its content."""
+    found = {}
+    for ending in ENDINGS:
+        folder = tmp_path_factory.mktemp("any")
+        path = write_any(folder, ending, SAMPLES.astype(np.int16))
+        damaged = path.with_name(path.name + ".yaml") if ending == ".raw" else path
+        found[ending] = (path, damaged, damaged.read_bytes())
+    return found
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(edits=changes)
+def test_any_bytes_are_a_volume_or_a_volume_file_error(ending: str, originals: dict, edits: list) -> None:
+    path, damaged, content = originals[ending]
+    damaged.write_bytes(changed(content, edits))
+    with contextlib.suppress(VolumeFileError):
+        assert isinstance(load_volume(path, max_bytes=2**20), Volume)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(edits=changes, ending=st.sampled_from([".nii.gz", ".nrrd"]))
+def test_any_header_inside_a_valid_gzip(originals: dict, edits: list, ending: str) -> None:
+    """Behind gzip's checksum a mutation of the file hardly ever reaches the NIfTI header; here it does."""
+    path, damaged, content = originals[ending]
+    start = 0 if ending == ".nii.gz" else content.index(b"\n\n") + 2
+    damaged.write_bytes(content[:start] + gzip.compress(changed(gzip.decompress(content[start:]), edits)))
+    with contextlib.suppress(VolumeFileError):
+        assert isinstance(load_volume(path, max_bytes=2**20), Volume)
+
+
+def test_the_originals_are_valid(originals: dict) -> None:
+    for path, damaged, content in originals.values():
+        damaged.write_bytes(content)
+        assert (load_volume(path).samples.numpy() == SAMPLES).all()
+
+
+def test_a_detached_header_with_a_huge_claim_costs_nothing(tmp_path: Path) -> None:
+    path = write_nrrd(tmp_path / "a.nhdr", SAMPLES.astype(np.uint8), "raw")
+    path.write_text(path.read_text().replace("sizes: 4 3 2", "sizes: 40000 40000 4000"))
+    refused(path, "6400000000000 bytes")

@@ -1,0 +1,420 @@
+"""Valid volume files, written by pynrrd, nibabel, tifffile and NumPy, and round trips through our own writers."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import nibabel
+import nrrd
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from filterlab.io import FORMATS, VolumeFileError, describe, load_volume, save_volume
+from filterlab.io.tiff import natural_key
+from filterlab.volume import Volume
+from tests.io.writers import (
+    AFFINE,
+    ENDINGS,
+    SAMPLES,
+    write_any,
+    write_nifti,
+    write_npy,
+    write_npz,
+    write_nrrd,
+    write_raw,
+    write_tiff,
+)
+
+WIDER = {"uint16": torch.int32, "uint32": torch.int64, "bool": torch.uint8}
+TYPES = ("uint8", "int8", "int16", "uint16", "int32", "uint32", "int64", "float32", "float64")
+LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+WRITTEN = [ending for known in FORMATS.values() for ending in known.written]
+
+
+def check(path: Path, expected: np.ndarray, affine: np.ndarray | None = None) -> Volume:
+    """The file holds these samples and this affine; its header says so without reading the voxels."""
+    volume, header = load_volume(path), describe(path)
+    dtype = WIDER.get(expected.dtype.name) or getattr(torch, expected.dtype.name)
+    assert (volume.dtype, volume.shape) == (dtype, expected.shape)
+    assert (volume.samples.numpy() == expected).all()
+    assert volume.samples.is_contiguous()
+    volume.samples += 1  # writable
+    assert (header.shape, header.dtype, header.size) == (tuple(expected.shape), dtype, expected.shape[:-4:-1])
+    assert header.stored == expected.dtype.name
+    assert (header.affine == volume.affine).all()
+    if affine is not None:
+        assert (volume.affine == affine).all()
+    return volume
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("dtype", TYPES)
+def test_types_and_byte_orders(tmp_path: Path, ending: str, order: str, dtype: str) -> None:
+    samples = SAMPLES.astype(np.dtype(dtype).newbyteorder(order))
+    samples.flat[0] = np.iinfo(dtype).max if samples.dtype.kind in "iu" else 0.1
+    check(write_any(tmp_path, ending, samples), samples.astype(dtype))
+
+
+@pytest.mark.parametrize("write", [write_npy, write_npz])
+def test_numpy_half_and_bool(tmp_path: Path, write) -> None:
+    for dtype in (np.float16, bool):
+        path = tmp_path / f"{np.dtype(dtype).name}{'.npy' if write is write_npy else '.npz'}"
+        check(write(path, SAMPLES.astype(dtype)), SAMPLES.astype(dtype))
+
+
+# --- NRRD -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoding", ["raw", "gzip", "gz", "bzip2", "bz2"])
+@pytest.mark.parametrize("ending", [".nrrd", ".nhdr"])
+def test_nrrd_encodings(tmp_path: Path, encoding: str, ending: str) -> None:
+    samples = SAMPLES.astype(np.int16)
+    volume = check(write_nrrd(tmp_path / f"a{ending}", samples, encoding), samples, AFFINE)
+    assert volume.spacing == (0.25, 0.5, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("space", "to_ras"),
+    [
+        ("right-anterior-superior", np.eye(4)),
+        ("RAS", np.eye(4)),
+        ("left-posterior-superior", LPS),
+        ("LPS", LPS),
+        ("left-anterior-superior", np.diag([-1.0, 1.0, 1.0, 1.0])),
+        ("scanner-xyz", np.eye(4)),
+        ("3D-left-handed", np.eye(4)),
+    ],
+)
+def test_nrrd_anatomical_spaces_become_ras(tmp_path: Path, space: str, to_ras: np.ndarray) -> None:
+    path = write_nrrd(tmp_path / "a.nrrd", SAMPLES.astype(np.uint8), space=space)
+    check(path, SAMPLES.astype(np.uint8), to_ras @ AFFINE)
+    assert describe(path).world == (None if space in ("scanner-xyz", "3D-left-handed") else "RAS")
+
+
+def nrrd_text(path: Path, header: str, data: bytes = bytes(24)) -> Path:
+    path.write_bytes(f"NRRD0004\n{header}\n\n".encode() + data)
+    return path
+
+
+MINIMAL = "type: unsigned char\ndimension: 3\nsizes: 4 3 2\nencoding: raw"
+
+
+@pytest.mark.parametrize(
+    ("fields", "spacing", "origin"),
+    [
+        ("", (1, 1, 1), (0, 0, 0)),
+        ("spacings: 1 .5 2e0", (1, 0.5, 2), (0, 0, 0)),
+        ("spacings: 1 .5 2\naxis mins: 10 20 nan", (1, 0.5, 2), (10.5, 20.25, 0)),
+        ("spacings: 1 .5 2\naxismins: 10 20 30\ncenters: node cell node", (1, 0.5, 2), (10, 20.25, 30)),
+        ("axis mins: 0 0 0\naxis maxs: 4 6 4\ncenterings: cell cell node", (1, 2, 4), (0.5, 1, 0)),
+        ("spacings: 1 2 3\nspace dimension: 3\nspace origin: ( 4 , 5 , 6 )", (1, 2, 3), (4, 5, 6)),
+    ],
+)
+def test_nrrd_per_axis_geometry(tmp_path: Path, fields: str, spacing: tuple, origin: tuple) -> None:
+    header = MINIMAL + ("\n" + fields if fields else "")
+    volume = load_volume(nrrd_text(tmp_path / "a.nrrd", header))
+    assert (volume.spacing, volume.origin, volume.size) == (spacing, origin, (4, 3, 2))
+
+
+def test_nrrd_skips_comments_key_values_and_bytes(tmp_path: Path) -> None:
+    data = bytes(range(24))
+    header = MINIMAL + "\n# a comment\nDICOM_0010:=x: y\nbyte skip: {}\ncontent: a thing"
+    for skip, stored in ((3, b"abc" + data), (-1, b"any length" + data)):
+        volume = load_volume(nrrd_text(tmp_path / "a.nrrd", header.format(skip), stored))
+        assert volume.samples.flatten().tolist() == list(data)
+    assert describe(tmp_path / "a.nrrd").fields["content"] == "a thing"
+
+
+def test_nrrd_detached_below_and_crlf(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "d.raw").write_bytes(bytes(range(24)))
+    (tmp_path / "a.nhdr").write_bytes((f"NRRD0004\n{MINIMAL}\ndatafile: sub/d.raw\n").replace("\n", "\r\n").encode())
+    assert load_volume(tmp_path / "a.nhdr").samples.flatten().tolist() == list(range(24))
+
+
+def test_nrrd_axes_of_one_entry_are_dropped(tmp_path: Path) -> None:
+    header = MINIMAL.replace("dimension: 3", "dimension: 4").replace("sizes: 4 3 2", "sizes: 1 4 3 2")
+    header += "\nspace: LPS\nspace directions: none (1,0,0) (0,1,0) (0,0,3)"
+    volume = load_volume(nrrd_text(tmp_path / "a.nrrd", header))
+    assert (volume.size, volume.spacing) == ((4, 3, 2), (1, 1, 3))
+
+
+# --- NIfTI ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "a2.nii", "a2.nii.gz"])
+def test_nifti_affine(tmp_path: Path, name: str) -> None:
+    samples = SAMPLES.astype(np.int16)
+    check(write_nifti(tmp_path / name, samples), samples, AFFINE)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "wide"), [("uint8", torch.float32), ("int16", torch.float32), ("int32", torch.float64)]
+)
+def test_nifti_scaling_is_applied(tmp_path: Path, dtype: str, wide: torch.dtype) -> None:
+    path = write_nifti(tmp_path / "a.nii.gz", SAMPLES.astype(dtype), slope=0.3, inter=-5.0)
+    volume, other = load_volume(path), nibabel.load(path)
+    assert volume.dtype == wide
+    assert describe(path).dtype == wide
+    assert float(volume.samples[1, 2, 3]) == pytest.approx(0.3 * SAMPLES[1, 2, 3] - 5, abs=1e-5)
+    np.testing.assert_allclose(volume.samples.numpy(), other.get_fdata().T, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("slope", [0.0, float("nan"), 1.0])
+def test_nifti_slopes_that_mean_none(tmp_path: Path, slope: float) -> None:
+    inter = 0.0 if slope == 1 else 5.0  # the intercept counts only with a slope
+    samples = SAMPLES.astype(np.int16)
+    check(write_nifti(tmp_path / "a.nii", samples, slope=slope, inter=inter), samples, AFFINE)
+
+
+def test_nifti_qform_and_bare_voxel_sizes(tmp_path: Path) -> None:
+    rotated = np.array([[0.0, 2.0, 0.0, 1.0], [-1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 3.0, 3.0], [0.0, 0.0, 0.0, 1.0]])
+    image = nibabel.Nifti1Image(SAMPLES.T.astype(np.uint8), None)
+    image.header.set_zooms((1, 2, 3))
+    nibabel.save(image, tmp_path / "bare.nii")
+    image.set_qform(rotated, code=1)
+    nibabel.save(image, tmp_path / "qform.nii")
+    for name in ("bare.nii", "qform.nii"):
+        assert np.array_equal(load_volume(tmp_path / name).affine, nibabel.load(tmp_path / name).affine)
+    np.testing.assert_allclose(load_volume(tmp_path / "qform.nii").affine, rotated, atol=1e-6)
+
+
+def test_nifti_trailing_axes_of_one_entry_and_extensions(tmp_path: Path) -> None:
+    image = nibabel.Nifti1Image(SAMPLES.T.astype(np.uint8)[..., None, None], AFFINE)
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", b"a" * 100))
+    nibabel.save(image, tmp_path / "a.nii.gz")
+    check(tmp_path / "a.nii.gz", SAMPLES.astype(np.uint8), AFFINE)
+
+
+def test_without_nibabel_the_error_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_nifti(tmp_path / "a.nii", SAMPLES.astype(np.uint8))
+    monkeypatch.setitem(sys.modules, "nibabel", None)
+    for action in (lambda: load_volume(path), lambda: save_volume(Volume(torch.zeros(1, 1, 1)), path)):
+        with pytest.raises(VolumeFileError, match=r"filterlab\[medical\]"):
+            action()
+
+
+# --- TIFF -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"bigtiff": True},
+        {"byteorder": ">"},
+        {"compression": "zlib"},
+        {"compression": "zlib", "predictor": 2},
+        {"rowsperstrip": 2},
+        {"rowsperstrip": 2, "compression": "zlib"},
+        {"tile": (16, 16)},
+        {"tile": (16, 16), "compression": "zlib"},
+    ],
+)
+def test_tiff_layouts(tmp_path: Path, options: dict) -> None:
+    samples = np.random.default_rng(0).integers(0, 60_000, (3, 21, 18)).astype(np.uint16)
+    check(write_tiff(tmp_path / "a.tiff", samples, **options), samples, np.eye(4))
+
+
+def test_tiff_imagej_voxel_sizes(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(
+        path,
+        SAMPLES.astype(np.uint8),
+        imagej=True,
+        resolution=(4.0, 2.0),
+        metadata={"axes": "ZYX", "spacing": 1.5, "unit": "um"},
+    )
+    assert check(path, SAMPLES.astype(np.uint8)).spacing == (0.25, 0.5, 1.5)
+
+
+def test_tiff_folder_in_natural_order(tmp_path: Path) -> None:
+    samples = np.arange(12 * 3 * 4).reshape(12, 3, 4).astype(np.int16)
+    (tmp_path / "notes.txt").write_text("not a slice")
+    for z in range(12):
+        tifffile.imwrite(tmp_path / f"slice{z}.tif", samples[z])
+    check(tmp_path, samples)
+    assert [p.name for p in sorted(map(Path, ("b1", "a10", "a9", "A2b")), key=natural_key)] == [
+        "A2b",
+        "a9",
+        "a10",
+        "b1",
+    ]
+
+
+# --- NumPy and raw ----------------------------------------------------------------------------------------------------
+
+
+def test_npy_fortran_order(tmp_path: Path) -> None:
+    samples = np.asfortranarray(SAMPLES.astype(">f4"))
+    check(write_npy(tmp_path / "a.npy", samples), SAMPLES.astype(np.float32), np.eye(4))
+    check(write_npz(tmp_path / "a.npz", samples), SAMPLES.astype(np.float32), np.eye(4))
+
+
+def test_npz_geometry_and_names(tmp_path: Path) -> None:
+    samples = SAMPLES.astype(np.float32)
+    check(write_npz(tmp_path / "a.npz", samples, affine=np.asfortranarray(AFFINE)), samples, AFFINE)
+    volume = check(
+        write_npz(tmp_path / "b.npz", samples, spacing=np.array([1, 2, 3]), origin=np.array([4.0, 5, 6])), samples
+    )
+    assert (volume.spacing, volume.origin) == ((1, 2, 3), (4, 5, 6))
+    np.savez(tmp_path / "c.npz", anything=samples, spacing=np.array([1.0, 2, 3]))
+    assert check(tmp_path / "c.npz", samples).spacing == (1, 2, 3)
+    np.savez(tmp_path / "d.npz", samples=samples, other=np.zeros(3))
+    check(tmp_path / "d.npz", samples, np.eye(4))
+
+
+@pytest.mark.parametrize("ending", [".npy", ".npz"])
+def test_numpy_batches(tmp_path: Path, ending: str) -> None:
+    volume = Volume(torch.arange(2 * 3 * 4 * 5 * 6).reshape(2, 3, 4, 5, 6), affine=AFFINE)
+    save_volume(volume, tmp_path / f"a{ending}")
+    found = load_volume(tmp_path / f"a{ending}")
+    assert torch.equal(found.samples, volume.samples)
+    assert np.array_equal(found.affine, AFFINE)
+
+
+def test_npy_sidecar_comes_and_goes(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    save_volume(Volume(torch.zeros(2, 3, 4), spacing=2.0), path)
+    assert sorted(os.listdir(tmp_path)) == ["a.npy", "a.npy.yaml"]
+    assert load_volume(path).spacing == (2, 2, 2)
+    np.save(path, np.zeros((2, 3, 5)))  # someone replaces the samples only
+    with pytest.raises(
+        VolumeFileError, match=r"a\.npy\.yaml: expected size \[5, 3, 2\] as in a\.npy; got size \[4, 3, 2\]"
+    ):
+        load_volume(path)
+    save_volume(Volume(torch.zeros(2, 3, 5)), path)
+    assert os.listdir(tmp_path) == ["a.npy"]
+
+
+def test_raw_sidecar(tmp_path: Path) -> None:
+    samples = SAMPLES.astype(">u2")
+    path = write_raw(tmp_path / "a.raw", samples, "spacing: [1, 2, 3]\norigin: [4, 5, 6]\n")
+    volume = check(path, SAMPLES.astype(np.uint16))
+    assert (volume.spacing, volume.origin) == ((1, 2, 3), (4, 5, 6))
+    path.write_bytes(b"head" + samples.tobytes())
+    sidecar = tmp_path / "other.raw.yaml"
+    rows = ", ".join(str(row) for row in AFFINE.tolist())
+    sidecar.write_text(f"file: a.raw\nsize: [4, 3, 2]\ndtype: uint16\nbyte_order: big\noffset: 4\naffine: [{rows}]\n")
+    check(sidecar, SAMPLES.astype(np.uint16), AFFINE)
+
+
+# --- round trips ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", WRITTEN)
+@pytest.mark.parametrize(
+    "dtype", [torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.float32, torch.float64]
+)
+def test_round_trips_are_exact(tmp_path: Path, ending: str, dtype: torch.dtype, rng: np.random.Generator) -> None:
+    affine = np.eye(4)
+    affine[:3] = rng.normal(size=(3, 4)) * [0.1, 1.0, 10.0, 1e3]
+    volume = Volume((200 * torch.rand(3, 4, 5, dtype=torch.float64) - 100).to(dtype), affine=affine)
+    path = tmp_path / f"a{ending}"
+    save_volume(volume, path)
+    found = load_volume(path)
+    assert found.dtype == dtype
+    assert torch.equal(found.samples, volume.samples)
+    assert np.array_equal(found.affine, affine)
+
+
+@pytest.mark.parametrize("ending", WRITTEN)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_floats_keep_their_values(tmp_path: Path, ending: str, dtype: torch.dtype) -> None:
+    volume = Volume(torch.randn(2, 3, 4).to(dtype).requires_grad_())
+    save_volume(volume, tmp_path / f"a{ending}")
+    assert torch.equal(load_volume(tmp_path / f"a{ending}").samples.double(), volume.samples.detach().double())
+
+
+def test_other_readers_agree_with_our_files(tmp_path: Path) -> None:
+    volume = Volume(torch.randn(3, 4, 5).transpose(0, 2), affine=AFFINE)  # not contiguous
+    save_volume(volume, tmp_path / "a.nrrd")
+    data, header = nrrd.read(str(tmp_path / "a.nrrd"), index_order="C")
+    assert (data == volume.samples.numpy()).all()
+    assert header["space"] == "right-anterior-superior"
+    assert (AFFINE[:3, :3] == header["space directions"].T).all()
+    assert (header["space origin"] == AFFINE[:3, 3]).all()
+    for name, kind in (("a.nii", nibabel.Nifti1Image), ("a.nii.gz", nibabel.Nifti1Image)):
+        save_volume(volume, tmp_path / name)
+        image = nibabel.load(tmp_path / name)
+        assert type(image) is kind  # AFFINE is exact in float32
+        assert (volume.samples.numpy() == image.get_fdata().T).all()
+        assert (image.affine == AFFINE).all()
+        np.testing.assert_allclose(image.header.get_zooms(), volume.spacing)
+    save_volume(Volume(volume.samples, spacing=0.1), tmp_path / "b.nii")
+    image = nibabel.load(tmp_path / "b.nii")
+    assert isinstance(image, nibabel.Nifti2Image)  # 0.1 is not
+    assert image.affine[0, 0] == 0.1
+    save_volume(volume, tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as archive:
+        assert (archive["affine"] == AFFINE).all()
+        assert (archive["samples"] == volume.samples.numpy()).all()
+
+
+def test_nrrd_and_nifti_describe_the_same_place(tmp_path: Path) -> None:
+    """An LPS NRRD and the NIfTI of the same scan put every voxel at the same world point."""
+    samples = SAMPLES.astype(np.int16)
+    from_nrrd = load_volume(write_nrrd(tmp_path / "a.nrrd", samples, space="left-posterior-superior"))
+    save_volume(from_nrrd, tmp_path / "a.nii")
+    assert (nibabel.load(tmp_path / "a.nii").affine == LPS @ AFFINE).all()
+    save_volume(load_volume(tmp_path / "a.nii"), tmp_path / "b.nrrd")
+    assert (load_volume(tmp_path / "b.nrrd").affine == from_nrrd.affine).all()
+
+
+# --- refusals of what is asked ----------------------------------------------------------------------------------------
+
+
+def test_names_and_places(tmp_path: Path) -> None:
+    volume = Volume(torch.zeros(2, 2, 2))
+    with pytest.raises(VolumeFileError, match=r"unknown ending '\.nrd'; did you mean '\.nrrd'\?"):
+        load_volume(tmp_path / "a.nrd")
+    with pytest.raises(FileNotFoundError, match="no file"):
+        load_volume(tmp_path / "a.nrrd")
+    with pytest.raises(VolumeFileError, match=r"a name that ends in \.nrrd, \.nii"):
+        save_volume(volume, tmp_path / "a.tif")
+    with pytest.raises(FileNotFoundError, match="existing folder"):
+        save_volume(volume, tmp_path / "b" / "a.nrrd")
+    with pytest.raises(VolumeFileError, match=rf"{tmp_path}/a\.nrrd: expected npy or npz"):
+        save_volume(Volume(torch.zeros(1, 2, 2, 2, 2)), tmp_path / "a.nrrd")
+    with pytest.raises(VolumeFileError, match=rf"{tmp_path}/a\.nii: expected samples .* got Volume.*uint32"):
+        save_volume(Volume(torch.zeros(2, 2, 2, dtype=torch.uint32)), tmp_path / "a.nii")
+    (tmp_path / "a.raw").write_bytes(b"1")
+    with pytest.raises(VolumeFileError, match="no such file"):
+        load_volume(tmp_path / "a.raw")
+    os.mkfifo(tmp_path / "pipe.nrrd")
+    with pytest.raises(VolumeFileError, match="pipe"):
+        load_volume(tmp_path / "pipe.nrrd")
+    assert sorted(os.listdir(tmp_path)) == ["a.raw", "pipe.nrrd"]
+
+
+def test_max_bytes(tmp_path: Path) -> None:
+    path = write_nrrd(tmp_path / "a.nrrd", SAMPLES.astype(np.uint16))  # int32 in memory
+    assert load_volume(path, max_bytes=96).size == (4, 3, 2)
+    with pytest.raises(VolumeFileError, match="at most 95 bytes"):
+        load_volume(path, max_bytes=95)
+
+
+# --- real scans -------------------------------------------------------------------------------------------------------
+
+
+def scans() -> list[Path]:
+    folder = os.environ.get("FILTERLAB_VOLUMES")
+    return sorted(p for p in Path(folder).iterdir() if p.name.endswith((".nrrd", ".nii.gz"))) if folder else []
+
+
+def test_real_scans_equal_what_other_readers_find() -> None:
+    if not scans():
+        pytest.skip("FILTERLAB_VOLUMES does not name a folder of scans")
+    for path in scans():
+        volume = load_volume(path)
+        if path.name.endswith(".nrrd"):
+            assert (nrrd.read(str(path), index_order="C")[0] == volume.samples.numpy()).all()
+        else:
+            image = nibabel.load(path)
+            assert (volume.samples.numpy() == np.asarray(image.dataobj).T).all()
+            assert (image.affine == volume.affine).all()

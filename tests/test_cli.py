@@ -1,0 +1,347 @@
+"""The command: what it writes, what it prints, its exit codes, and that a mistake leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from filterlab import METHODS, Volume, load_volume, resample, save_volume, signals
+from filterlab.cli import UsageError, main, split_overrides
+from filterlab.io import load_image
+
+SCENE = """
+signal: {name: marschner-lobb, samples: 12}
+method: triquadratic
+transfer:
+  points:
+  - {value: 0.0, color: [0, 0, 1], opacity: 0.0}
+  - {value: 1.0, color: [1, 0.5, 0], opacity: 0.5}
+camera: {direction: [1, 2, -1]}
+size: [24, 16]
+step: 1
+"""
+
+
+@pytest.fixture
+def volume_file(tmp_path: Path) -> Path:
+    path = tmp_path / "in.nrrd"
+    samples = 100 * signals.marschner_lobb().sample((6, 5, 4)).samples
+    save_volume(Volume(samples.round().to(torch.uint8), spacing=(1, 2, 3), origin=(10, 20, 30)), path)
+    return path
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.yaml"
+    path.write_text(SCENE)
+    return path
+
+
+def fails(capsys: pytest.CaptureFixture[str], arguments: list[object], code: int, *words: str) -> None:
+    """The command ends with that exit code and these words on stderr, without a traceback."""
+    assert main([str(a) for a in arguments]) == code
+    printed = capsys.readouterr()
+    assert "Traceback" not in printed.err
+    for word in words:
+        assert word in printed.err, printed.err
+    assert printed.out == ""
+
+
+# --- help and usage ---------------------------------------------------------------------------------------------------
+
+
+def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"filterlab {version('filterlab')}\n"
+    for arguments in ([], ["--help"]):
+        assert main(arguments) == 0
+        printed = capsys.readouterr().out
+        assert all(name in printed for name in ("render", "resample", "methods", "info"))
+    for name in ("render", "resample", "info"):
+        assert main([name, "--help"]) == 0
+        assert f"filterlab {name} " in capsys.readouterr().out.split("examples:")[1]  # an example to copy
+
+
+def test_a_line_that_makes_no_sense(capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.nrrd"
+    fails(capsys, ["rendr"], 2, "render, resample, methods, info")
+    fails(capsys, ["resample", volume_file], 2, "--output")
+    fails(capsys, ["resample", volume_file, "-o", out], 2, "one of --spacing, --shape and --like; got none")
+    fails(capsys, ["resample", volume_file, "-o", out, "--spacing", "1", "1"], 2, "--spacing")
+    fails(capsys, ["resample", volume_file, "-o", out, "--spacing", *"111", "--shape", *"222"], 2, "got several")
+    fails(capsys, ["info"], 2, "FILE")
+    fails(capsys, ["methods", "--size", "3"], 2, "--size")
+    assert not out.exists()
+
+
+def test_the_installed_command_in_its_own_process(tmp_path: Path) -> None:
+    run = [sys.executable, "-m", "filterlab"]
+    done = subprocess.run([*run, "info", str(tmp_path / "none.nrrd")], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("filterlab: ")
+    assert "Traceback" not in done.stderr
+
+
+def test_help_does_not_wait_for_torch() -> None:
+    code = "import sys; from filterlab.cli import main; main(['render', '--help']); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def test_split_overrides() -> None:
+    line = "render s.yaml --size 512 512 -o a.png --method notch --camera.position -1 2.5 -.5 --lit --name=a b.yaml"
+    known, overrides = split_overrides(line.split())
+    assert known == ["render", "s.yaml", "-o", "a.png", "b.yaml"]
+    assert overrides == {
+        "size": "[512, 512]",
+        "method": "notch",
+        "camera.position": "[-1, 2.5, -.5]",
+        "lit": "true",
+        "name": "a",
+    }
+    assert split_overrides(["render", "--help"]) == (["render", "--help"], {})
+    assert split_overrides(["render", "s", "--output=a.png"]) == (["render", "s", "--output=a.png"], {})
+    with pytest.raises(UsageError, match="--size again"):
+        split_overrides(["render", "--size", "1", "--size", "2"])
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "word"), [(KeyboardInterrupt(), 130, "interrupted"), (MemoryError(), 1, "memory")]
+)
+def test_interrupted_and_out_of_memory(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    volume_file: Path,
+    error: BaseException,
+    code: int,
+    word: str,
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("filterlab.resampling.resample", stop)
+    fails(capsys, ["resample", volume_file, "-o", volume_file.with_name("out.nrrd"), "--shape", *"222"], code, word)
+    assert os.listdir(volume_file.parent) == ["in.nrrd"]
+
+
+def test_our_own_mistakes_keep_their_traceback(monkeypatch: pytest.MonkeyPatch, volume_file: Path) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise TypeError("a defect")
+
+    monkeypatch.setattr("filterlab.resampling.resample", stop)
+    with pytest.raises(TypeError, match="a defect"):
+        main(["resample", str(volume_file), "-o", str(volume_file.with_name("out.nrrd")), "--shape", *"222"])
+
+
+# --- methods and info -------------------------------------------------------------------------------------------------
+
+
+def test_methods_shows_every_fact(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["methods"]) == 0
+    rows = {line.split("│")[1].strip(): line.split("│") for line in capsys.readouterr().out.splitlines() if "│" in line}
+    assert set(rows) == set(METHODS)
+    for name, method in METHODS.items():
+        cells = [cell.strip() for cell in rows[name][1:-1]]
+        f = method.facts
+        assert cells[1:3] == [str(f.support), str(f.taps)]
+        assert cells[3].startswith(str(f.approximation_order))
+        assert (f"({f.approximation_order_without_prefilter})" in cells[3]) == f.prefiltered
+        assert cells[4] == f"C{f.continuity}"
+        assert cells[5].startswith("yes") == f.interpolating
+        assert cells[6] == ", ".join(f.gradients)
+        assert cells[7] == ", ".join(f.schemes)
+        assert cells[8] == method.summary
+
+
+def facts(text: str) -> dict[str, str]:
+    """Lines of two columns as a dict."""
+    rows = [line.strip().split("  ", 1) for line in text.splitlines() if "  " in line.strip()]
+    return {name.strip(): value.strip() for name, value in rows}
+
+
+def test_info(capsys: pytest.CaptureFixture[str], volume_file: Path) -> None:
+    assert main(["info", str(volume_file)]) == 0
+    found = facts(capsys.readouterr().out)
+    samples = load_volume(volume_file).samples
+    assert found["size (x, y, z)"] == "6 × 5 × 4"
+    assert found["type"] == "uint8"
+    assert (found["spacing"], found["origin"], found["extent"]) == ("1 2 3", "10 20 30", "6 10 12")
+    assert found["range"] == f"{samples.min()} … {samples.max()}"
+    assert found["mean"] == f"{samples.double().mean():.6g}"
+    assert found["world axes"] == "RAS"
+    assert main(["info", str(volume_file), "--header-only"]) == 0
+    assert "range" not in facts(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("samples", "shares", "extra"),
+    [
+        (np.array([0, 0, 0, 1, 2, 2, 3, 3], np.uint8), [37.5, 12.5, 25, 25], {"range": "0 … 3"}),
+        (np.array([-128, 127, 127, 127], np.int8), [25] + 14 * [0] + [75], {"range": "-128 … 127"}),
+        (np.array([-(2**63), 2**63 - 1]), [50] + 14 * [0] + [50], {}),
+        (np.array([0, 0.5, 1, np.nan, -np.inf]), [33.33] + 7 * [0] + [33.33] + 6 * [0] + [33.33], {"not finite": "2"}),
+        (np.array([7.0, 7.0]), [], {"range": "7 … 7", "mean": "7"}),
+        (np.array([np.nan]), [], {"range": "no finite values"}),
+    ],
+)
+def test_info_histograms(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, samples: np.ndarray, shares: list[float], extra: dict[str, str]
+) -> None:
+    np.save(tmp_path / "a.npy", samples.reshape(1, 1, -1))
+    assert main(["info", str(tmp_path / "a.npy")]) == 0
+    found = facts(capsys.readouterr().out)
+    assert [float(v.split("%")[0]) for k, v in found.items() if k.startswith("from ")] == shares
+    assert {k: found[k] for k in extra} == extra
+
+
+def test_info_shows_a_rotated_affine_and_odd_names(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    affine = np.array([[0, -1, 0, 5.0], [1, 0, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]])
+    path = tmp_path / "[red]a.npz"
+    save_volume(Volume(torch.zeros(2, 3, 4), affine=affine), path)
+    assert main(["info", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert facts(printed)["affine"] == "0 -1 0 5"
+    assert "[red]a.npz" in printed
+
+
+def test_info_of_a_damaged_file(capsys: pytest.CaptureFixture[str], volume_file: Path) -> None:
+    volume_file.write_bytes(volume_file.read_bytes()[:-4])
+    fails(capsys, ["info", volume_file.with_name("none.nrrd")], 1, "none.nrrd")
+    assert main(["info", str(volume_file), "-H"]) == 0
+    capsys.readouterr()
+    assert main(["info", str(volume_file)]) == 1
+    assert "in.nrrd: expected gzip data" in capsys.readouterr().err
+
+
+# --- resample ---------------------------------------------------------------------------------------------------------
+
+
+def test_resample_is_the_library_s(volume_file: Path, tmp_path: Path) -> None:
+    volume, out = load_volume(volume_file), tmp_path / "out.npz"
+    line = ["resample", str(volume_file), "-o", str(out), "--method", "notch"]
+    assert main([*line, "--spacing", "0.5", "1", "1.5", "--boundary", "reflect"]) == 0
+    expected = resample(volume, "notch", spacing=(0.5, 1, 1.5), boundary="reflect")
+    assert torch.equal(load_volume(out).samples, expected.samples)
+    assert np.array_equal(load_volume(out).affine, expected.affine)
+    assert main([*line, "--shape", "7", "8", "9", "--dtype", "float64"]) == 0
+    found = load_volume(out)
+    assert (found.size, found.dtype) == ((7, 8, 9), torch.float64)
+    assert torch.equal(found.samples, resample(volume, "notch", shape=(9, 8, 7), dtype=torch.float64).samples)
+
+
+def test_resample_like_another_volume(volume_file: Path, tmp_path: Path) -> None:
+    affine = np.array([[0.5, 0.1, 0, 11.0], [-0.1, 0.5, 0, 22], [0, 0, 1, 31], [0, 0, 0, 1]])
+    like, out = tmp_path / "like.nii.gz", tmp_path / "out.nii.gz"
+    save_volume(Volume(torch.zeros(3, 4, 5, dtype=torch.uint8), affine=affine), like)
+    assert main(["resample", str(volume_file), "-o", str(out), "--like", str(like)]) == 0
+    expected = resample(load_volume(volume_file), like=load_volume(like))
+    assert torch.equal(load_volume(out).samples, expected.samples)
+    assert np.array_equal(load_volume(out).affine, load_volume(like).affine)
+
+
+def test_resample_to_integers_rounds_and_clips(tmp_path: Path) -> None:
+    step = Volume(torch.tensor([0, 0, 0, 255, 255, 255], dtype=torch.uint8).expand(2, 2, 6).contiguous())
+    save_volume(step, tmp_path / "in.nrrd")
+    line = ["resample", str(tmp_path / "in.nrrd"), "-o", str(tmp_path / "out.nrrd"), "--shape", "24", "2", "2"]
+    assert main([*line, "--method", "tricubic", "--dtype", "input"]) == 0
+    found = load_volume(tmp_path / "out.nrrd").samples
+    exact = resample(step, "tricubic", shape=(2, 2, 24)).samples
+    assert exact.min() < -1  # the prefiltered cubic overshoots
+    assert exact.max() > 256
+    assert found.dtype == torch.uint8
+    assert torch.equal(found, exact.clamp(0, 255).round().to(torch.uint8))
+    for dtype in ("int64", "int32"):
+        save_volume(Volume(torch.full((1, 1, 2), 1e30)), tmp_path / "big.nrrd")
+        line = ["resample", str(tmp_path / "big.nrrd"), "-o", str(tmp_path / "out.nrrd"), "--shape", *"211"]
+        assert main([*line, "--dtype", dtype]) == 0
+        assert (load_volume(tmp_path / "out.nrrd").samples == torch.iinfo(getattr(torch, dtype)).max).all()
+
+
+def test_resample_refuses_before_it_works(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path
+) -> None:
+    def never(*_: object, **__: object) -> None:
+        pytest.fail("the voxels must not be read")
+
+    monkeypatch.setattr("filterlab.io.volumes.load_volume", never)
+    (tmp_path / "link.nrrd").symlink_to(volume_file)
+    batch = tmp_path / "batch.npy"
+    np.save(batch, np.zeros((1, 2, 3, 4, 5)))
+    before = sorted(os.listdir(tmp_path))
+    out, shape = tmp_path / "out.nrrd", ["--shape", 2, 2, 2]
+
+    def refused(*words: str, source: Path = volume_file, to: Path = out, more: list | None = None) -> None:
+        fails(capsys, ["resample", source, "-o", to, *(shape if more is None else more)], 1, *words)
+
+    refused("unknown method 'noch'; did you mean 'notch'?", "triquadratic", more=[*shape, "--method", "noch"])
+    refused("unknown boundary 'miror'; did you mean 'mirror'?", more=[*shape, "--boundary", "miror"])
+    refused("unknown dtype 'uint9'; did you mean 'uint8'?", more=[*shape, "--dtype", "uint9"])
+    refused("other than the input", to=volume_file)
+    refused("other than the input", to=tmp_path / "link.nrrd")
+    refused("other than the input", more=["--like", out])
+    refused("existing folder", to=tmp_path / "missing" / "out.nrrd")
+    refused("a name that ends in .nrrd", to=tmp_path / "out.tif")
+    refused("npy or npz", source=batch)
+    refused("no file", source=tmp_path / "none.nrrd")
+    refused("did you mean '.nrrd'", source=tmp_path / "none.nrd")
+    refused("no file", more=["--like", tmp_path / "none.nrrd"])
+    refused("positive", more=["--spacing", 1, 0, 1])
+    refused("positive", more=["--spacing", 1, "nan", 1])
+    refused("1 or more", more=["--shape", 1, 0, 1])
+    refused("--max-gigabytes", "GiB", more=["--spacing", 1e-5, 1e-5, 1e-5])
+    refused("--max-gigabytes", more=["--shape", 300, 300, 300, "--max-gigabytes", 0.1])
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+# --- render -----------------------------------------------------------------------------------------------------------
+
+
+def test_render(scene_file: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a.png"
+    assert main(["render", str(scene_file), "-o", str(out)]) == 0
+    image = load_image(out)
+    assert image.shape == (16, 24, 3)
+    assert image.max() > 0.2
+    assert image.std() > 0.01
+    assert main(["render", str(scene_file), "-o", str(out), "--method", "notch", "--size", "8", "6"]) == 0
+    assert load_image(out).shape == (6, 8, 3)
+    assert capfd.readouterr() == ("", "")  # no bar where nobody looks
+    assert sorted(os.listdir(tmp_path)) == ["a.png", "scene.yaml"]
+
+
+def test_render_of_a_volume_file(scene_file: Path, volume_file: Path, tmp_path: Path) -> None:
+    text = SCENE.replace("signal: {name: marschner-lobb, samples: 12}", f"volume: {volume_file.name}")
+    scene_file.write_text(text.replace("value: 1.0", "value: 100"))
+    assert main(["render", str(scene_file), "-o", str(tmp_path / "a.png")]) == 0
+    assert load_image(tmp_path / "a.png").std() > 0.01
+
+
+def test_render_refuses_before_it_works(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene_file: Path, tmp_path: Path
+) -> None:
+    def never(*_: object, **__: object) -> None:
+        pytest.fail("nothing must be rendered")
+
+    monkeypatch.setattr("filterlab.render.scene.render_scene", never)
+    out = tmp_path / "a.png"
+    fails(capsys, ["render", scene_file, "-o", out, "--method", "noch"], 1, "did you mean 'notch'?", "tricubic")
+    fails(capsys, ["render", scene_file, "-o", out, "--camera.fov", "3"], 1, "--camera.fov: camera.fov: unknown key")
+    fails(capsys, ["render", scene_file, "-o", out, "--size", "8"], 1, "--size: size")
+    fails(capsys, ["render", scene_file, "-o", out, "--device", "moon"], 1, "device", "'moon'")
+    fails(capsys, ["render", scene_file, "-o", tmp_path / "a.jpg"], 1, "ends in .png")
+    fails(capsys, ["render", scene_file, "-o", tmp_path / "no" / "a.png"], 1, "existing folder")
+    fails(capsys, ["render", tmp_path / "no.yaml", "-o", out], 1, "no.yaml")
+    fails(capsys, ["render", tmp_path, "-o", out], 1, "a folder")
+    fails(capsys, ["render", scene_file, "-o", out, "--size", "8", "8", "--size", "9", "9"], 2, "--size again")
+    scene_file.write_text(SCENE + "colour: red\n")
+    fails(capsys, ["render", scene_file, "-o", out], 1, "scene.yaml:11: colour: unknown key 'colour'")
+    picture = tmp_path / "scene.png"
+    scene_file.rename(picture)
+    fails(capsys, ["render", picture, "-o", picture], 1, "other than the input")
+    assert sorted(os.listdir(tmp_path)) == ["scene.png"]
