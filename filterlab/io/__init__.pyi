@@ -1,0 +1,21 @@
+from .atomic import atomic_write
+from .bounded import VolumeFileError, VolumeHeader
+from .config import ConfigError, StrictModel, dump_config, load_config
+from .images import load_image, save_image
+from .volumes import FORMATS, describe, load_volume, save_volume
+
+__all__ = [
+    "FORMATS",
+    "ConfigError",
+    "StrictModel",
+    "VolumeFileError",
+    "VolumeHeader",
+    "atomic_write",
+    "describe",
+    "dump_config",
+    "load_config",
+    "load_image",
+    "load_volume",
+    "save_image",
+    "save_volume",
+]

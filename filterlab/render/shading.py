@@ -1,0 +1,147 @@
+"""Blinn-Phong shading of samples by their gradients, with directional lights.
+
+Letters: n the normal, the gradient made a unit vector; l the direction to a light, v to the viewer, h halfway between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light infinitely far away.
+
+    Attributes:
+        direction: world vector from the scene *to* the light, any length but zero; None is a headlight, which always
+            shines along the ray.
+        color: linear RGB of the light, ≥ 0.
+
+    Both may be tensors that require grad.
+    """
+
+    direction: Sequence[float] | Tensor | None = None
+    color: Sequence[float] | Tensor = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if self.direction is not None:
+            d = torch.as_tensor(self.direction, dtype=torch.float64).detach()
+            if d.shape != (3,) or not d.isfinite().all() or not d.any():
+                raise ValueError(
+                    f"a light's direction must be three finite numbers, not all zero; got {self.direction!r}"
+                )
+        c = torch.as_tensor(self.color, dtype=torch.float64).detach()
+        if c.shape != (3,) or not c.isfinite().all() or (c < 0).any():
+            raise ValueError(f"a light's color must be three finite numbers ≥ 0 (linear RGB); got {self.color!r}")
+
+
+@dataclass(frozen=True)
+class Shading:
+    """Two-sided Blinn-Phong.
+
+    lit = rgb · (ambient + diffuse Σ_k I_k |n·l_k|) + specular Σ_k I_k |n·h_k|^shininess
+
+    with l_k to light k of colour I_k, h_k = (l_k + v)/|l_k + v|. A zero gradient has no normal: only the ambient term
+    is left, and derivatives (the second too) are finite there. Directions are world directions and the gradient is per
+    world unit, so that stretched voxels are lit as the stretched object would be.
+
+    Attributes:
+        lights: one or more; a single white headlight by default.
+        ambient, diffuse, specular: weights ≥ 0.
+        shininess: exponent of the highlight, ≥ 1.
+
+    Numbers may be tensors that require grad; differentiable in them, the colour, the gradient and the ray.
+
+    Source: Blinn, Models of light reflection for computer synthesized pictures, 1977.
+    """
+
+    lights: Sequence[Light] = field(default_factory=lambda: (Light(),))
+    ambient: float | Tensor = 0.2
+    diffuse: float | Tensor = 0.7
+    specular: float | Tensor = 0.3
+    shininess: float | Tensor = 32.0
+
+    def __post_init__(self) -> None:
+        for name, least in (("ambient", 0), ("diffuse", 0), ("specular", 0), ("shininess", 1)):
+            value = _plain(getattr(self, name))
+            if not least <= value < float("inf"):
+                raise ValueError(f"{name} must be a finite number ≥ {least}; got {value}")
+        if not all(isinstance(light, Light) for light in self.lights):
+            raise TypeError(f"lights must be Light objects; got {self.lights!r}")
+
+    @property
+    def requires_grad(self) -> bool:
+        """True when any parameter is a tensor that requires grad."""
+        values = [self.ambient, self.diffuse, self.specular, self.shininess]
+        values += [v for light in self.lights for v in (light.direction, light.color)]
+        return any(isinstance(v, Tensor) and v.requires_grad for v in values)
+
+    def brightest(self, color: float) -> float:
+        """An upper bound of every lit component for colours of at most `color`."""
+        light = torch.stack([_numbers(light.color).detach().cpu() for light in self.lights] or [torch.zeros(3)])
+        total = float(light.sum(0).max())
+        return color * (_plain(self.ambient) + _plain(self.diffuse) * total) + _plain(self.specular) * total
+
+    def __call__(self, color: Tensor, gradient: Tensor, direction: Tensor) -> Tensor:
+        """Lit colours `(..., 3)`, of colours `(..., 3)`, gradients `(..., 3)` and unit ray directions `(..., 3)`."""
+        normal, view = safe_normalize(gradient), -direction
+        matt, shine = self._sums(normal, view)
+        ambient, diffuse, specular = (_like(x, color) for x in (self.ambient, self.diffuse, self.specular))
+        return color * (ambient + diffuse * matt) + specular * shine
+
+    def _sums(self, normal: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+        """Σ I |n·l| and Σ I |n·h|^shininess, `(..., 3)` each."""
+        matt, shine = torch.zeros((), dtype=view.dtype, device=view.device), torch.zeros_like(normal[..., :1])
+        shininess = _like(self.shininess, view)
+        for light in self.lights:
+            tint = _like(light.color, view)
+            if light.direction is None:
+                facing = half = _dot(normal, view).abs()
+            else:
+                to_light = safe_normalize(_like(light.direction, view))
+                facing = _dot(normal, to_light).abs()
+                half = _dot(normal, safe_normalize(to_light + view)).abs()
+            matt = matt + tint * facing[..., None]
+            shine = shine + tint * _power(half, shininess)[..., None]
+        return matt, shine
+
+
+def safe_normalize(vector: Tensor) -> Tensor:
+    """vector / |vector| along the last axis, and 0 (with derivative 0) for the zero vector.
+
+    Vectors are first divided by their largest component, held constant: the result does not depend on the scale, so its
+    derivatives of every order are unchanged, while neither tiny nor huge vectors under- or overflow.
+    """
+    largest = vector.detach().abs().amax(-1, keepdim=True)
+    zero = largest == 0
+    scaled = vector / torch.where(zero, torch.ones_like(largest), largest)
+    scaled = torch.where(zero, torch.zeros_like(scaled), scaled)
+    squared = _dot(scaled, scaled)[..., None]
+    return scaled / torch.where(zero, torch.ones_like(squared), squared).sqrt()
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Σ_d a_d b_d in the order x, y, z, whatever the number of vectors: a reduction might regroup."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def _power(base: Tensor, exponent: Tensor) -> Tensor:
+    """base^exponent for base ≥ 0, and 0 with derivative 0 at base = 0 (where 1 < exponent < 2 has no second one)."""
+    positive = base != 0
+    return torch.where(positive, torch.where(positive, base, torch.ones_like(base)) ** exponent, torch.zeros_like(base))
+
+
+def _plain(value: float | Tensor) -> float:
+    return float(value.detach() if isinstance(value, Tensor) else value)
+
+
+def _numbers(value: Sequence[float] | float | Tensor) -> Tensor:
+    return torch.as_tensor(value, dtype=torch.float64)
+
+
+def _like(value: Sequence[float] | float | Tensor, example: Tensor) -> Tensor:
+    return torch.as_tensor(value, dtype=example.dtype, device=example.device)

@@ -1,0 +1,193 @@
+"""Transfer functions: scalar -> linear RGB and opacity per unit distance.
+
+Letters: v a field's value; x_j the control points; α opacity; s a world length; τ optical depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import torch
+from torch import Tensor
+
+Numbers = Sequence[float] | Tensor
+Peak = tuple[float | Tensor, float | Tensor, float | Tensor, Numbers]
+
+
+# a triangle this near to its foot is at its foot: between peaks the opacity is exactly 0, not the rounding of 1 − 1
+_FOOT = 1e-12
+
+
+class Located(NamedTuple):
+    """Where values fall between control points: interval `(...)` (integer) and fraction `(...)` in 0 … 1."""
+
+    interval: Tensor
+    fraction: Tensor
+
+    def at(self, index: Tensor) -> Located:
+        """Those of some of the values `(S,)`."""
+        return Located(self.interval.index_select(0, index), self.fraction.index_select(0, index))
+
+
+class TransferFunction:
+    """Piecewise linear in the scalar: colour and opacity are interpolated between control points.
+
+    α(v) = (1−w) α_j + w α_{j+1}, w = (v − x_j)/(x_{j+1} − x_j), likewise linear RGB; constant beyond both ends, and
+    exact at every control point. What is interpolated is α, the opacity of `unit` world length; the extinction
+    −log1p(−α)/unit follows from it. A value of NaN gives NaN, so that a defect shows instead of vanishing.
+
+    Args:
+        positions: `(M,)` increasing scalars x_j.
+        colors: `(M, 3)` linear RGB, ≥ 0 (more than 1 is allowed: a glow).
+        opacities: `(M,)` opacities per `unit`, 0 … 1; 1 is exactly opaque.
+        unit: the world length that the opacities are for.
+
+    All three tables may be tensors that require grad; everything is differentiable in them and in the scalar. At
+    α = 1, where the derivative of the transmittance (1−α)^(s/unit) is infinite for s < unit, it is taken as 0.
+
+    Raises:
+        ValueError: wrong shapes, not increasing, out of range, not finite.
+    """
+
+    def __init__(self, positions: Numbers, colors: Sequence[Numbers] | Tensor, opacities: Numbers, unit: float = 1.0):
+        self.positions = _table("positions", positions)
+        self.colors = _table("colors", colors)
+        self.opacities = _table("opacities", opacities)
+        self.unit = float(unit)
+        _check_tables(self)
+
+    @classmethod
+    def triangle_peaks(cls, peaks: Sequence[Peak], unit: float = 1.0) -> Self:
+        """A sum of triangle-shaped peaks (center, width, height, rgb).
+
+        α(v) = Σ height_k · max(0, 1 − |v − center_k| / (width_k/2)): `width` is the width of the base, `height` the
+        opacity at the apex. Where peaks overlap the colour is their mean weighted by opacity (at the corners of the
+        sum, linear in between); outside all peaks α = 0.
+
+        Raises:
+            ValueError: no peak, a width that is not positive, heights whose sum leaves 0 … 1 somewhere.
+
+        Source: Csébfalvi, section 5 ("a transfer function that consists of two triangle-shaped peaks").
+        """
+        if not len(peaks) or any(len(peak) != 4 for peak in peaks):
+            raise ValueError(f"peaks must be one or more (center, width, height, rgb); got {peaks!r}")
+        centers, halves, heights = (torch.stack([_scalar(peak[k]) for peak in peaks]) for k in range(3))
+        halves = halves / 2
+        colors = torch.stack([torch.as_tensor(peak[3], dtype=torch.float64) for peak in peaks])
+        if not (halves.detach() > 0).all():
+            raise ValueError(f"peak widths must be positive; got {(2 * halves).tolist()}")
+        x = torch.cat((centers - halves, centers, centers + halves)).sort().values
+        x = x[torch.cat((x.new_ones(1, dtype=torch.bool), x.detach().diff() > 0))]
+        climb = 1 - (x[:, None] - centers).abs() / halves  # (M, peaks)
+        shares = torch.where(climb > _FOOT, heights * climb, torch.zeros_like(climb))
+        # at a foot every share is 0: the colour is that of the peaks that end there
+        touching = (climb.detach() >= -_FOOT).to(x.dtype)
+        total = shares.sum(-1, keepdim=True)
+        weights = torch.where(total > 0, shares, touching + torch.finfo(x.dtype).tiny)
+        rgb = (weights / weights.sum(-1, keepdim=True)) @ colors
+        return cls(x, rgb, total[:, 0], unit)
+
+    @property
+    def requires_grad(self) -> bool:
+        """True when any table requires grad."""
+        return any(t.requires_grad for t in (self.positions, self.colors, self.opacities))
+
+    @property
+    def transparent_somewhere(self) -> bool:
+        """True when some value has opacity 0."""
+        return bool((self.opacities == 0).any())
+
+    @property
+    def opaque_somewhere(self) -> bool:
+        """True when some value has opacity 1."""
+        return bool((self.opacities >= 1).any())
+
+    @property
+    def brightest(self) -> float:
+        """The largest colour component."""
+        return float(self.colors.detach().max())
+
+    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Self:
+        """The same function computing in another type; gradients flow back to the original tables."""
+        out = object.__new__(type(self))
+        for name in ("positions", "colors", "opacities"):
+            setattr(out, name, getattr(self, name).to(dtype=dtype, device=device))
+        out.unit = self.unit
+        if bool((out.positions.detach().diff() <= 0).any()):
+            raise ValueError(f"control points of the transfer function coincide in {dtype}: {self.positions.tolist()}")
+        _check_tables(out)  # again: an optimizer may have moved them since
+        return out
+
+    def locate(self, value: Tensor) -> Located:
+        """Between which control points the values `(...)` lie; the one search that opacity and colour share."""
+        x = self.positions
+        if len(x) == 1:
+            return Located(torch.zeros_like(value, dtype=torch.int32), torch.zeros_like(value) * value)
+        interval = torch.searchsorted(x[1:-1].detach().contiguous(), value.detach(), right=True, out_int32=True)
+        fraction = (value - _take(x[:-1], interval)) / _take(x.diff(), interval)
+        return Located(interval, fraction.clamp(0, 1))
+
+    def opacity(self, located: Located) -> Tensor:
+        """Opacities per unit, `(...)`."""
+        return self._interpolate(self.opacities, located.interval, located.fraction)
+
+    def color(self, located: Located) -> Tensor:
+        """Linear RGB, `(..., 3)`."""
+        return self._interpolate(self.colors, located.interval, located.fraction[..., None])
+
+    def optical_depth(self, opacity: Tensor, length: Tensor) -> Tensor:
+        """τ = −log1p(−α) · length / unit, `(...)`; ∞ for α = 1 over any length > 0, with derivative 0 there."""
+        length = length / self.unit
+        if not self.opaque_somewhere:
+            return -torch.log1p(-opacity) * length
+        opaque = opacity >= 1
+        depth = -torch.log1p(-torch.where(opaque, torch.zeros_like(opacity), opacity)) * length
+        return torch.where(opaque & (length > 0), torch.full_like(depth, torch.inf), depth)
+
+    def __call__(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """(linear RGB `(..., 3)`, opacity per unit `(...)`) of values `(...)`, in promote(value, float32)."""
+        value = value.to(torch.promote_types(value.dtype, torch.float32))
+        function = self.to(value.dtype, value.device)
+        located = function.locate(value)
+        return function.color(located), function.opacity(located)
+
+    def _interpolate(self, table: Tensor, interval: Tensor, fraction: Tensor) -> Tensor:
+        if len(table) == 1:
+            return _take(table, interval) + 0 * fraction
+        return torch.lerp(_take(table[:-1], interval), _take(table[1:], interval), fraction)  # exact at both ends
+
+
+def _take(table: Tensor, interval: Tensor) -> Tensor:
+    return table.index_select(0, interval.reshape(-1)).reshape(interval.shape + table.shape[1:])
+
+
+def _scalar(value: Numbers | float) -> Tensor:
+    return torch.as_tensor(value, dtype=torch.float64).reshape(())
+
+
+def _table(name: str, values: Sequence | Tensor) -> Tensor:
+    try:
+        return values if isinstance(values, Tensor) else torch.as_tensor(values, dtype=torch.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers; got {values!r}") from None
+
+
+def _check_tables(transfer: TransferFunction) -> None:
+    x, rgb, alpha = (t.detach() for t in (transfer.positions, transfer.colors, transfer.opacities))
+    m = x.numel()
+    if x.ndim != 1 or m == 0 or rgb.shape != (m, 3) or alpha.shape != (m,):
+        raise ValueError(
+            "expected M ≥ 1 control points with positions (M,), colors (M, 3), opacities (M,); "
+            f"got {tuple(x.shape)}, {tuple(rgb.shape)}, {tuple(alpha.shape)}"
+        )
+    if not all(t.dtype.is_floating_point and bool(t.isfinite().all()) for t in (x, rgb, alpha)):
+        raise ValueError("positions, colors and opacities must be finite floating-point numbers")
+    if m > 1 and not bool((x.diff() > 0).all()):
+        raise ValueError(f"positions must increase from one control point to the next; got {x.tolist()}")
+    if not bool(((alpha >= 0) & (alpha <= 1)).all()):
+        raise ValueError(f"opacities must lie in 0 … 1; got {alpha.tolist()}")
+    if not bool((rgb >= 0).all()):
+        raise ValueError(f"colors must not be negative; got {rgb.tolist()}")
+    if not 0 < transfer.unit < float("inf"):
+        raise ValueError(f"unit must be a positive world length; got {transfer.unit}")

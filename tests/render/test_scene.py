@@ -1,0 +1,178 @@
+"""Scenes: what they build, that they say what is wrong, and that the example scenes are valid."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from filterlab import signals
+from filterlab.fields.base import Field
+from filterlab.io import save_volume
+from filterlab.io.config import ConfigError, dump_config
+from filterlab.methods import reconstruct
+from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
+from filterlab.render.scene import build, find_volume, load_scene, render_scene
+
+SCENES = Path(__file__).parents[2] / "configs" / "scenes"
+
+MINIMAL = """
+signal: {name: marschner-lobb, samples: 12}
+transfer:
+  peaks: [{center: 0.5, width: 0.2, height: 0.8, color: [1.0, 0.5, 0.2]}]
+size: [12, 8]
+"""
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    def write(text, name="scene.yaml"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def saved_volume(folder, name="volume.nrrd"):
+    volume = signals.marschner_lobb().sample(10, dtype=torch.float32)
+    save_volume(volume, folder / name)
+    return volume
+
+
+def test_a_scene_is_what_its_parts_render(scene_file):
+    text = (
+        MINIMAL
+        + """
+method: {name: notch, boundary: reflect, prefilter: false}
+step: 0.7
+camera: {projection: orthographic, direction: [0.2, 0.9, -0.3], window: [0.25, 0.0, 0.75, 1.0]}
+lighting: {lights: [{direction: [1.0, 2.0, 3.0], color: [1.0, 0.5, 0.5]}, {}], ambient: 0.1, shininess: 9}
+background: [0.1, 0.2, 0.3]
+region: {lower: [-0.5, -1.0, -1.0], upper: [1.0, 1.0, 1.0]}
+jitter: 4
+termination: 0.01
+precision: float64
+"""
+    )
+    image = render_scene(load_scene(scene_file(text)))
+    signal = signals.marschner_lobb()
+    field = reconstruct(signal.sample(12), "notch", boundary="reflect", prefilter=False)
+    expected = render(
+        field,
+        OrthographicCamera.framing(field.domain, (0.2, 0.9, -0.3), aspect=3.0, window=(0.25, 0.0, 0.75, 1.0)),
+        TransferFunction.triangle_peaks([(0.5, 0.2, 0.8, (1.0, 0.5, 0.2))], unit=2 / 12),
+        size=(12, 8),
+        step=0.7,
+        shading=Shading((Light((1.0, 2.0, 3.0), (1.0, 0.5, 0.5)), Light()), ambient=0.1, shininess=9),
+        background=(0.1, 0.2, 0.3),
+        region=((-0.5, -1, -1), (1, 1, 1)),
+        jitter_seed=4,
+        termination=0.01,
+        dtype=torch.float64,
+    )
+    assert image.shape == (8, 12, 3)
+    torch.testing.assert_close(image, expected[..., :3], rtol=0, atol=1e-12)
+    assert image.std() > 0.05
+
+
+def test_defaults_cost_nothing_and_overrides_change_what_they_name(scene_file, monkeypatch):
+    path = scene_file(MINIMAL)
+    scene = load_scene(path)
+    prepared = build(scene)
+    assert isinstance(prepared.camera, PerspectiveCamera)
+    assert all(prepared.options[k] is None for k in ("shading", "region", "jitter_seed", "termination"))
+    orders = []
+    jet = type(prepared.field).jet
+    monkeypatch.setattr(type(prepared.field), "jet", lambda f, p, order: (orders.append(order), jet(f, p, order))[1])
+    render_scene(scene)
+    assert set(orders) == {0}
+    changed = load_scene(path, {"method": "notch", "size": "[4, 6]", "camera.field_of_view": "20"})
+    assert changed.method is not None
+    assert (changed.method.name, changed.size, changed.camera.field_of_view) == ("notch", (4, 6), 20.0)
+
+
+def test_an_exact_signal_is_its_own_field_and_normalized_axes_span_the_samples(scene_file):
+    exact = load_scene(scene_file(MINIMAL), {"signal.samples": "null"})
+    assert isinstance(build(exact).field, signals.Signal)
+    text = MINIMAL.replace("peaks:", "axis: normalized\n  peaks:")
+    samples = signals.marschner_lobb().sample(12).samples
+    low, high = samples.min().item(), samples.max().item()
+    transfer = build(load_scene(scene_file(text))).transfer
+    half = 0.1 * (high - low)
+    middle = (low + high) / 2
+    assert transfer.positions.tolist() == pytest.approx([middle - half, middle, middle + half], rel=1e-5)
+
+
+def test_volume_files_are_found_beside_the_scene_and_by_variables(scene_file, tmp_path, monkeypatch):
+    saved_volume(tmp_path)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    saved_volume(elsewhere, "other.nrrd")
+    path = scene_file(MINIMAL.replace("signal: {name: marschner-lobb, samples: 12}", "volume: volume.nrrd"))
+    scene = load_scene(path)
+    field = build(scene).field
+    assert isinstance(field, Field)
+    assert render_scene(scene).std() > 0.01
+    monkeypatch.delenv("FILTERLAB_VOLUMES", raising=False)
+    with pytest.raises(ConfigError, match=r"volume.*found none at .*other\.nrrd.*FILTERLAB_VOLUMES"):
+        load_scene(path, {"volume": "other.nrrd"})
+    monkeypatch.setenv("FILTERLAB_VOLUMES", str(elsewhere))
+    assert find_volume("other.nrrd", tmp_path) == elsewhere / "other.nrrd"
+    assert find_volume("$FILTERLAB_VOLUMES/other.nrrd", tmp_path) == elsewhere / "other.nrrd"
+    with pytest.raises(ValueError, match="environment variables that are set"):
+        find_volume("$FILTERLAB_NO_SUCH/other.nrrd", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"method": "noch"}, "method.*did you mean 'notch'.*trilinear"),
+        ({"signal.name": "marschner"}, "signal.*known signals.*franke"),
+        ({"signal.parameters": "{frequenzy: 3}"}, "frequenzy.*did you mean 'frequency'"),
+        ({"method": "{name: notch, boundary: periodic}"}, "known boundarys|boundary.*wrap"),
+        ({"method": "{name: tricubic, gradient: central}"}, "offers the gradients analytic"),
+        ({"signal.samples": "null", "method": "notch"}, "needs no method"),
+        ({"transfer.points": "[{value: 0, color: [1, 1, 1], opacity: 0.5}]"}, "transfer.*got both"),
+        ({"transfer": "{}"}, "expected points or peaks"),
+        ({"transfer.peaks[0].height": "2"}, r"transfer.peaks\[0\].height"),
+        ({"transfer.peaks[0].centre": "2"}, "centre.*did you mean 'center'"),
+        ({"camera": "{position: [0, 0, 0]}"}, "camera.*position and target together"),
+        ({"camera": "{direction: [0, 0, 1]}"}, "camera.*up must not lie along"),
+        ({"camera": "{height: 3}"}, "camera.*height goes with"),
+        ({"camera": "{window: [0, 0, 0, 1]}"}, "camera.*window"),
+        ({"camera.projection": "fisheye"}, "camera.projection.*perspective"),
+        ({"lighting": "{lights: [{direction: [0, 0, 0]}]}"}, r"lights\[0\].*direction"),
+        ({"region": "{lower: [0, 0, 0], upper: [1, 1, 0]}"}, "region.*lower < upper"),
+        ({"step": "0"}, "step"),
+        ({"size": "[0, 5]"}, "size"),
+        ({"termination": "1.5"}, "termination"),
+        ({"stepp": "1"}, "did you mean 'step'"),
+        ({"volume": "missing.nrrd"}, "found none"),
+    ],
+)
+def test_mistakes_name_the_key_and_the_known_names(scene_file, overrides, message):
+    with pytest.raises(ConfigError, match=message):
+        load_scene(scene_file(MINIMAL), overrides)
+
+
+def test_a_volume_and_a_signal_are_too_much_and_none_too_little(scene_file, tmp_path):
+    saved_volume(tmp_path)
+    with pytest.raises(ConfigError, match="either a volume or a signal; got both"):
+        load_scene(scene_file(MINIMAL + "volume: volume.nrrd\n"))
+    with pytest.raises(ConfigError, match="either a volume or a signal"):
+        load_scene(scene_file(MINIMAL.replace("signal: {name: marschner-lobb, samples: 12}", "")))
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda p: p.stem)
+def test_example_scenes_render_and_survive_a_round_trip(path, scene_file, tmp_path):
+    saved_volume(tmp_path, "any.npz")
+    overrides = {"size": "[6, 4]", "step": "2"}
+    if "\nvolume:" in path.read_text():
+        overrides["volume.file"] = str(tmp_path / "any.npz")
+    scene = load_scene(path, overrides)
+    assert render_scene(scene).isfinite().all()
+    assert load_scene(scene_file(dump_config(scene))) == scene
+
+
+def test_there_are_example_scenes():
+    assert {p.stem for p in SCENES.glob("*.yaml")} >= {"engine", "marschner_lobb", "head_mri"}

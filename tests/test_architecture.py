@@ -1,0 +1,165 @@
+"""The shape of the house: imports point one way, public names are pinned, nothing depends on this machine."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import filterlab
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "filterlab"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+# each room may import the rooms before it (and itself); the same number: neither imports the other
+FLOORS = {
+    "volume": 0,
+    "kernels": 0,
+    "prefilters": 1,
+    "ops": 2,
+    "fields": 3,
+    "signals": 4,
+    "methods": 4,
+    "resampling": 5,
+    "spectrum": 5,
+    "metrics": 5,
+    "io": 5,
+    "render": 6,
+    "cli": 8,
+    "__init__": 9,
+    "__main__": 9,
+}
+
+
+def room(path: Path) -> str:
+    part = path.relative_to(PACKAGE).parts[0]
+    return part.removesuffix(".py")
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Dotted names of everything that a file imports, wherever the import stands."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path.name}: relative imports hide which way an import points"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def rooms_imported(path: Path) -> set[str]:
+    modules = {m.split(".")[1] for m in imported_modules(path) if m.startswith("filterlab.")}
+    return {m for m in modules if (PACKAGE / m).is_dir() or (PACKAGE / f"{m}.py").is_file()}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_point_one_way(path):
+    own = room(path)
+    assert own in FLOORS, f"the room {own} has no floor yet: add it to FLOORS where the flow puts it"
+    for other in rooms_imported(path) - {own}:
+        assert FLOORS[other] < FLOORS[own], (
+            f"{path.relative_to(ROOT)} imports filterlab.{other}, which stands above or beside it"
+        )
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_the_library_imports_neither_experiments_nor_tests(path):
+    assert not {m.split(".")[0] for m in imported_modules(path)} & {"experiments", "tests", "benchmarks"}
+
+
+def test_the_floors_say_what_the_drawing_says():
+    """kernels, volume → prefilters → ops → fields → methods → render."""
+    flow = [FLOORS[name] for name in ("kernels", "prefilters", "ops", "fields", "methods", "render")]
+    assert flow == sorted(set(flow))
+
+
+def test_the_oracle_is_independent():
+    for name in ("oracles.py", "laws.py"):
+        modules = imported_modules(ROOT / "tests" / name)
+        assert not [m for m in modules if m.startswith(("filterlab", "experiments"))]
+
+
+def test_public_names_are_pinned():
+    assert set(filterlab.__all__) == PUBLIC
+    assert list(filterlab.__all__) == sorted(filterlab.__all__)
+    assert all(hasattr(filterlab, name) for name in filterlab.__all__)
+
+
+PUBLIC = {
+    "KERNELS",
+    "METHODS",
+    "PREFILTERS",
+    "Boundary",
+    "Field",
+    "Method",
+    "Volume",
+    "from_grid_sample",
+    "from_zyx",
+    "io",
+    "kernels",
+    "load_volume",
+    "metrics",
+    "prefilters",
+    "reconstruct",
+    "render",
+    "resample",
+    "save_volume",
+    "signals",
+    "spectrum",
+}
+
+
+def project_files() -> list[Path]:
+    """Every text file of the project: what git tracks or would track, or the usual folders where git is absent."""
+    try:
+        listed = subprocess.run(
+            ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.splitlines()
+        files = [ROOT / name for name in listed]
+    except (OSError, subprocess.CalledProcessError):
+        folders = ("filterlab", "tests", "experiments", "configs", "benchmarks", "docs")
+        files = [p for folder in folders for p in (ROOT / folder).rglob("*")] + list(ROOT.glob("*.*"))
+    text = {".py", ".md", ".toml", ".yaml", ".yml", ".txt", ".j2", ".cfg", ""}
+    return [p for p in files if p.is_file() and p.suffix in text]
+
+
+def test_nothing_needs_a_path_of_one_machine():
+    """No file reaches out of the repository: the folder beside it, a home folder, a working folder."""
+    outside = ["../" + "shared", "/" + "work/", "/" + "root/", "/" + "home/"]
+    found = [
+        f"{path.relative_to(ROOT)}: {word}"
+        for path in project_files()
+        for word in outside
+        if word in path.read_text(encoding="utf-8", errors="replace")
+    ]
+    assert not found
+
+
+def test_words_have_one_meaning():
+    """No module is called by a word that says nothing, and nothing is called just `filter`."""
+    banned = {"utils", "util", "helpers", "helper", "misc", "common", "filter", "filters"}
+    assert not [p for p in SOURCES if p.stem in banned or set(p.relative_to(PACKAGE).parts[:-1]) & banned]
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            name = getattr(node, "name", None) or getattr(node, "arg", None)
+            assert name not in banned, f"{path.relative_to(ROOT)} calls something {name!r}"
+
+
+def test_importing_the_library_is_quiet_and_leaves_heavy_optional_packages_alone():
+    code = (
+        "import sys, warnings; warnings.simplefilter('error'); import filterlab; "
+        "late = {'nibabel', 'kornia', 'skimage', 'matplotlib', 'scipy', 'jinja2'} & set(sys.modules); "
+        "assert not late, late"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == done.stderr == ""

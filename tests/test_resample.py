@@ -1,0 +1,175 @@
+"""resample: separable passes give what the field gives point by point, on the grid that was asked for."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+from filterlab.kernels import bc
+from filterlab.methods import METHODS, reconstruct
+from filterlab.resampling import resample
+from filterlab.volume import Boundary, Volume
+from tests import laws, oracles
+from tests.test_volume import rotated
+
+every_method = pytest.mark.parametrize("method", METHODS)
+every_boundary = pytest.mark.parametrize("boundary", Boundary)
+
+
+def volume(*shape: int) -> torch.Tensor:
+    return torch.as_tensor(np.random.default_rng(0).uniform(-1, 1, shape or (5, 7, 6)))
+
+
+def centres(grid: Volume) -> torch.Tensor:
+    """World positions of all voxel centres, (D, H, W, 3)."""
+    z, y, x = np.indices(grid.shape[-3:])
+    return grid.voxel_to_world(torch.as_tensor(np.stack([x, y, z], -1).astype(float)))
+
+
+@every_method
+@every_boundary
+@pytest.mark.parametrize("prefilter", [True, False])
+def test_separable_equals_the_field_point_by_point(method, boundary, prefilter):
+    source = Volume(volume(), spacing=(1.0, 0.5, 2.0), origin=(3.0, -1.0, 0.0))
+    like = Volume(torch.zeros(3, 9, 8), spacing=(1.7, 0.4, 9.0), origin=(-4.0, -0.7, -6.0))  # well beyond the box
+    field = reconstruct(source, method, boundary=boundary, prefilter=prefilter)
+    for target in ({"shape": (4, 11, 9)}, {"spacing": (0.7, 0.9, 1.3)}, {"like": like}):
+        out = resample(source, method, boundary=boundary, prefilter=prefilter, **target)
+        assert out.dtype == torch.float64
+        laws.assert_close(out.samples, field(centres(out)), 1e-12)
+
+
+@every_boundary
+@pytest.mark.parametrize("method", ["trilinear", "notch", "tricubic", "ncrsi"])
+def test_equals_the_oracle(method, boundary):
+    f = volume(4, 3, 5)
+    like = Volume(torch.zeros(6, 7, 8), spacing=(0.9, 0.55, 0.8), origin=(-1.1, -0.3, -0.4))
+    out = resample(f, method, boundary=boundary, like=like)
+    (expected,) = oracles.reconstruct(method, f.numpy(), centres(like).reshape(-1, 3).numpy(), str(boundary), order=0)
+    laws.assert_close(out.samples, expected.reshape(6, 7, 8), 1e-12)
+
+
+@pytest.mark.parametrize("rotation", [False, True], ids=["aligned", "rotated"])
+def test_geometry_of_a_new_shape_and_of_a_new_spacing(rotation):
+    """The box of voxels stays (shape), or its centre does (spacing)."""
+    geometry = {"affine": rotated((0.5, 1.0, 2.0))} if rotation else {"spacing": (0.5, 1.0, 2.0), "origin": (1, 2, 3)}
+    source = Volume(volume(5, 8, 6), **geometry)
+
+    def corners(v):
+        ends = [(-0.5, n - 0.5) for n in v.size]
+        return v.voxel_to_world(torch.tensor(list(product(*ends)), dtype=torch.float64))
+
+    out = resample(source, "trilinear", shape=(10, 4, 9))
+    assert out.shape == (10, 4, 9)
+    assert out.spacing == pytest.approx((0.5 * 6 / 9, 1.0 * 8 / 4, 2.0 * 5 / 10))
+    laws.assert_close(corners(out), corners(source), 1e-12, 10)
+    out = resample(source, "trilinear", spacing=(0.8, 0.7, 0.6))
+    assert out.spacing == pytest.approx((0.8, 0.7, 0.6))
+    assert out.size == (4, 11, 17)  # 3 / 0.8 = 3.75, 8 / 0.7 = 11.4, 10 / 0.6 = 16.7
+    laws.assert_close(corners(out).mean(0), corners(source).mean(0), 1e-12, 10)
+    direction = out.affine[:3, :3] / out.spacing
+    laws.assert_close(direction, source.affine[:3, :3] / source.spacing, 1e-13)
+
+
+@every_method
+def test_resampling_onto_its_own_grid_returns_the_samples_of_an_interpolating_method(method):
+    source = Volume(volume(), affine=rotated())
+    for target in ({"like": source}, {"shape": source.shape}, {"spacing": source.spacing}):
+        out = resample(source, method, **target)
+        laws.assert_close(out.affine, source.affine, 1e-13, 10)
+        if METHODS[method].facts.interpolating:
+            laws.assert_close(out.samples, source.samples, 1e-12)
+        else:
+            assert float((out.samples - source.samples).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("method", ["triquadratic", "ncrsi", "notch"])
+def test_a_rotated_grid_is_sampled_point_by_point(method):
+    source = Volume(volume(), spacing=(1.0, 0.5, 2.0), origin=(3.0, -1.0, 0.0))
+    like = Volume(torch.zeros(3, 4, 5), affine=rotated(origin=(4.0, 1.0, 2.0)))
+    out = resample(source, method, like=like)
+    laws.assert_close(out.affine, like.affine, 0.0)
+    laws.assert_close(out.samples, reconstruct(source, method)(centres(like)), 1e-12)
+    batched = resample(Volume(volume(2, 3, 5, 7, 6), affine=source.affine), method, like=like)
+    assert batched.shape == (2, 3, 3, 4, 5)
+    laws.assert_close(
+        batched.samples[1, 2],
+        resample(Volume(volume(2, 3, 5, 7, 6)[1, 2], affine=source.affine), method, like=like).samples,
+        1e-13,
+    )
+
+
+def test_grids_that_are_permuted_or_flipped_are_right_too():
+    source = Volume(volume(5, 7, 6))
+    affine = np.array([[0, 0, 1, 0], [0, -1, 0, 6], [1, 0, 0, 0], [0, 0, 0, 1.0]])  # x and z exchanged, y flipped
+    out = resample(source, "triquadratic", like=Volume(torch.zeros(6, 7, 5), affine=affine))
+    laws.assert_close(out.samples, source.samples.permute(2, 1, 0).flip(1), 1e-12)
+
+
+@every_method
+def test_a_batch_is_a_loop(method):
+    f = volume(2, 2, 4, 3, 5)
+    out = resample(f, method, shape=(5, 6, 4))
+    assert out.shape == (2, 2, 5, 6, 4)
+    for n, c in product(range(2), range(2)):
+        laws.assert_close(out.samples[n, c], resample(f[n, c], method, shape=(5, 6, 4)).samples, 1e-13)
+
+
+@pytest.mark.parametrize(
+    "storage", [torch.uint8, torch.int16, torch.float16, torch.bfloat16, torch.float32, torch.float64]
+)
+def test_types(storage):
+    f = (volume() * 100 + 120).to(storage)
+    kept = f.clone()
+    out = resample(f, "notch", shape=(7, 7, 7))
+    assert out.dtype == torch.promote_types(storage, torch.float32)
+    exact = resample(f.double(), "notch", shape=(7, 7, 7)).samples
+    laws.assert_close(out.samples, exact, 1e-12 if storage == torch.float64 else 5e-6, 240)
+    assert torch.equal(f, kept)
+    assert resample(f, "notch", shape=(7, 7, 7), dtype=torch.float64).dtype == torch.float64
+
+
+def test_differentiable_with_an_exact_adjoint():
+    for method in ("trilinear", "ncrsi", "notch", "tricubic"):
+        laws.assert_adjoint(lambda f, method=method: resample(f, method, shape=(5, 2, 4)).samples, volume(3, 4, 3))
+        laws.assert_adjoint(
+            lambda f, method=method: resample(f, method, boundary="zeros", spacing=(0.6, 1.1, 0.8)).samples,
+            volume(3, 2, 3),
+        )
+    b, c = (torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (0.3, 0.2))
+
+    def function(b, c, f):
+        return resample(f, bc(b, c), shape=(3, 2, 2), prefilter=False).samples
+
+    f = volume(2, 2, 1).requires_grad_()
+    assert torch.autograd.gradcheck(function, (b, c, f))
+    mapped = torch.func.vmap(lambda f: resample(f, "tricubic", shape=(2, 5, 3)).samples)(volume(2, 3, 4, 3))
+    laws.assert_close(mapped[1], resample(volume(2, 3, 4, 3)[1], "tricubic", shape=(2, 5, 3)).samples, 1e-13)
+
+
+def test_float32_positions_do_not_drift_on_long_axes():
+    f = volume(1, 1, 3000).float()
+    out = resample(f, "tricubic", shape=(1, 1, 4096))
+    exact = resample(f.double(), "tricubic", shape=(1, 1, 4096))
+    laws.assert_close(out.samples, exact.samples, 5e-6, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("target", "match"),
+    [
+        ({}, "exactly one"),
+        ({"shape": (2, 2, 2), "spacing": 1.0}, "exactly one"),
+        ({"shape": (2, 2)}, "shape"),
+        ({"shape": (2, 0, 2)}, "shape"),
+        ({"shape": (2, 2.5, 2)}, "shape"),
+        ({"spacing": (1, -1, 1)}, "positive"),
+        ({"shape": (2, 2, 2), "method": "sinc"}, "known methods"),
+        ({"shape": (2, 2, 2), "boundary": "clamp"}, "mirror"),
+    ],
+)
+def test_callers_mistakes(target, match):
+    with pytest.raises(ValueError, match=match):
+        resample(torch.zeros(3, 3, 3), **target)

@@ -1,0 +1,139 @@
+"""Schemes: sums of trilinear samples equal the direct sum, take as many samples as the paper says, round as told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from filterlab.fields.tensor_product import SAMPLERS, exact_sample
+from filterlab.methods import METHODS, reconstruct
+from filterlab.volume import Boundary
+from tests import laws, oracles
+
+SAMPLED = [name for name, method in METHODS.items() if "eight_trilinear" in method.facts.schemes]
+SHAPE = (5, 7, 6)
+every_sampled = pytest.mark.parametrize("method", SAMPLED)
+every_boundary = pytest.mark.parametrize("boundary", Boundary)
+
+
+def volume() -> torch.Tensor:
+    return torch.as_tensor(np.random.default_rng(0).uniform(-1, 1, SHAPE))
+
+
+def points(count: int = 60, beyond: float = 1.5) -> torch.Tensor:
+    n = np.array(SHAPE[::-1])
+    return torch.as_tensor(np.random.default_rng(1).uniform(-beyond, 1 + beyond, (count, 3)) * n)
+
+
+def ties() -> torch.Tensor:
+    """Every combination of integers, half-integers and quarters of one cell, and of its ends."""
+    t = torch.tensor([1.0, 1.25, 1.5, 1.75, 2.0, 2.5], dtype=torch.float64)
+    return torch.cartesian_prod(t, t, t)
+
+
+def pair(method: str, boundary: str = "mirror", prefilter: bool = True):
+    gradient = METHODS[method].sampled_gradient
+    return [
+        reconstruct(volume(), method, boundary=boundary, prefilter=prefilter, gradient=gradient, scheme=scheme)
+        for scheme in ("direct", "eight_trilinear")
+    ]
+
+
+@every_sampled
+@every_boundary
+@pytest.mark.parametrize("prefilter", [True, False])
+def test_eight_trilinear_agrees_with_direct_to_rounding_ties_included(method, boundary, prefilter):
+    direct, sampled = pair(method, str(boundary), prefilter)
+    for at in (points(), ties()):
+        for a, b in zip(sampled.value_and_gradient(at), direct.value_and_gradient(at), strict=True):
+            laws.assert_close(a, b, 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("method", "value", "value_and_gradient"),
+    [("triquadratic", 8, 8), ("notch", 8, 8), ("tricubic", 8, 32), ("ncrsi", 7, 7), ("trilinear", 1, 7)],
+)
+def test_the_number_of_samples_is_the_paper_s(method, value, value_and_gradient):
+    counted = []
+
+    def counting(coefficients, at):
+        counted.append(at.shape[1])
+        return exact_sample(coefficients, at)
+
+    field = reconstruct(volume(), method, scheme="eight_trilinear", sampler=counting)
+    for order, expected in ((0, value), (1, value_and_gradient)):
+        counted.clear()
+        field.jet(points(), order)
+        assert sum(counted) == expected * 60
+
+
+@every_sampled
+@every_boundary
+@pytest.mark.parametrize("prefilter", [True, False])
+def test_a_texture_unit_rounds_fractions_to_1_256(method, boundary, prefilter):
+    """Sample by sample as the oracle does it."""
+    field = reconstruct(
+        volume(), method, boundary=boundary, prefilter=prefilter, scheme="eight_trilinear", sampler="texture_unit"
+    )
+    at = points(beyond=0.8)
+    expected = oracles.trilinear_scheme(method, volume().numpy(), at.numpy(), str(boundary), prefilter, steps=256)
+    for actual, exact in zip(field.value_and_gradient(at), expected, strict=True):
+        laws.assert_close(actual, exact, 1e-12)
+
+
+@every_sampled
+def test_what_a_texture_unit_costs_is_bounded_and_not_nothing(method):
+    """A rounded fraction moves a sample by at most 1/512 of a step along each axis; a slope by four times that."""
+    exact = reconstruct(volume(), method, scheme="eight_trilinear")
+    rounded = reconstruct(volume(), method, scheme="eight_trilinear", sampler="texture_unit")
+    deconvolve = oracles.RECIPES[method].deconvolve if method in oracles.RECIPES else ()
+    c = oracles.coefficients(volume().numpy(), deconvolve, "mirror", np.arange(-8, 16))
+    sample_error = 3 / 512 * np.ptp(c)
+    (v, g), (w, h) = (field.value_and_gradient(points(400)) for field in (exact, rounded))
+    bound = {"ncrsi": 2.5}.get(method, 1) * sample_error  # the weights of ncrsi add up to 2.5 in absolute value at most
+    assert 1e-4 < float((v - w).abs().max()) <= bound
+    assert 1e-4 < float((g - h).abs().max()) <= 4 * sample_error
+
+
+def test_texture_unit_is_exact_at_multiples_of_1_256():
+    exact, rounded = (
+        reconstruct(volume(), "trilinear", scheme="eight_trilinear", gradient="central", sampler=sampler)
+        for sampler in ("exact", "texture_unit")
+    )
+    at = torch.randint(0, 256 * 4, (50, 3)).double() / 256
+    laws.assert_close(rounded(at), exact(at), 1e-14)
+    laws.assert_close(rounded(at + 0.3 / 256), exact(at), 1e-14)
+    laws.assert_close(rounded(at - 0.3 / 256), exact(at), 1e-14)
+
+
+def test_the_rounding_is_invisible_to_derivatives():
+    """Straight-through: autograd through the texture unit gives the slope of the sample it took, not zero."""
+    at = points(beyond=0).requires_grad_()
+    fields = [
+        reconstruct(volume(), "triquadratic", scheme="eight_trilinear", sampler=sampler)
+        for sampler in ("exact", "texture_unit")
+    ]
+    slopes = [torch.autograd.grad(field(at).sum(), at)[0] for field in fields]
+    assert float((slopes[0] - slopes[1]).abs().max()) < 0.2
+    assert float(slopes[1].abs().mean()) > 0.1
+
+
+def test_a_callable_is_a_sampler():
+    def nearest(coefficients, at):
+        return exact_sample(coefficients, at.round())
+
+    f = volume()
+    field = reconstruct(f, "trilinear", scheme="eight_trilinear", gradient="central", sampler=nearest)
+    laws.assert_close(field(torch.tensor([[1.2, 3.4, 2.6]], dtype=torch.float64)), f[3, 3, 1][None], 1e-15)
+    assert set(SAMPLERS) >= {"exact", "texture_unit"}
+
+
+@every_sampled
+def test_a_field_tells_how_it_is_evaluated(method):
+    direct, sampled = pair(method)
+    assert direct.scheme.name == "direct"
+    assert sampled.scheme.name == "eight_trilinear"
+    assert sampled.scheme.gradient == METHODS[method].sampled_gradient
+    assert sampled.max_order == 1
+    assert reconstruct(volume(), method).scheme.name == "direct"

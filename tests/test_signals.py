@@ -1,0 +1,136 @@
+"""Signals: published values, exact gradients against finite differences, sampling and geometry."""
+
+from __future__ import annotations
+
+import inspect
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from filterlab import signals
+from tests import laws
+
+every_signal = pytest.mark.parametrize("name", signals.SIGNALS)
+
+
+def inside(signal: signals.Signal, count: int = 200) -> torch.Tensor:
+    lower, upper = (torch.tensor(c, dtype=torch.float64) for c in (signal.domain.lower, signal.domain.upper))
+    return lower + (upper - lower) * torch.rand(count, 3, dtype=torch.float64)
+
+
+@every_signal
+def test_gradient_and_hessian_are_differences(name):
+    signal = signals.named(name)
+    points = inside(signal)
+    value, gradient, hessian = signal.jet(points, 2)
+    laws.assert_close(gradient, laws.finite_difference(signal, points, 2e-4), 2e-7, float(gradient.abs().max()))
+    differences = laws.finite_difference(lambda p: signal.value_and_gradient(p)[1], points, 2e-4)
+    laws.assert_close(hessian, differences, 2e-6, float(hessian.abs().max()))
+    assert torch.equal(value, signal(points))
+    assert torch.equal(gradient, signal.value_and_gradient(points)[1])
+
+
+@every_signal
+def test_autograd_of_the_value_is_the_gradient(name):
+    signal = signals.named(name)
+    points = inside(signal).requires_grad_()
+    value, gradient = signal.value_and_gradient(points)
+    (along,) = torch.autograd.grad(value.sum(), points)
+    laws.assert_close(along, gradient, 1e-10, float(gradient.detach().abs().max()))
+
+
+@every_signal
+def test_centre_and_axes_are_finite(name):
+    """r = 0 is where a naive gradient divides by zero."""
+    signal = signals.named(name)
+    points = torch.tensor([[0, 0, 0], [0, 0, 0.5], [0.5, 0, 0], [1, 1, 1]], dtype=torch.float64, requires_grad=True)
+    for quantity in signal.jet(points, 2 if name != "sphere-distance" else 1):
+        assert torch.isfinite(quantity).all()
+    (along,) = torch.autograd.grad(signal(points).sum(), points)
+    assert torch.isfinite(along).all()
+
+
+@every_signal
+def test_the_box_tells_how_to_sample_it(name):
+    signal = signals.named(name)
+    volume = signal.sample((4, 5, 6))
+    assert volume.shape == (6, 5, 4)
+    assert volume.dtype == torch.float64
+    lower, upper = np.array(signal.domain.lower), np.array(signal.domain.upper)
+    assert volume.spacing == pytest.approx(tuple((upper - lower) / [4, 5, 6]))
+    z, y, x = np.indices((6, 5, 4))
+    world = volume.voxel_to_world(torch.as_tensor(np.stack([x, y, z], -1).astype(float)))
+    laws.assert_close(volume.samples, signal(world), 1e-14, float(volume.samples.abs().max()))
+    laws.assert_close(world[0, 0, 0], lower + (upper - lower) / [8, 10, 12], 1e-14)
+    nodes = signal.sample(3, centering="node", dtype=torch.float32)
+    assert nodes.dtype == torch.float32
+    corners = nodes.voxel_to_world(torch.tensor([[0.0, 0, 0], [2, 2, 2]]))
+    laws.assert_close(corners, np.stack([lower, upper]), 1e-6)
+
+
+def test_marschner_lobb_as_printed():
+    """ρ = (1 − sin(πz/2) + α (1 + cos(2π f cos(πr/2)))) / (2 (1 + α)), f = 6, α = ¼."""
+    p = inside(signals.marschner_lobb()).numpy()
+    r = np.hypot(p[:, 0], p[:, 1])
+    rho = np.cos(2 * np.pi * 6 * np.cos(np.pi * r / 2))
+    expected = (1 - np.sin(np.pi * p[:, 2] / 2) + 0.25 * (1 + rho)) / (2 * 1.25)
+    laws.assert_close(signals.marschner_lobb()(torch.as_tensor(p)), expected, 1e-13)
+
+
+def test_franke_as_printed():
+    """Renka 1988, test function 1, at (0, 0, 0), where every exponent is a short sum."""
+    expected = 0.75 * math.exp(-3) + 0.75 * math.exp(-1 / 49 - 0.2)
+    expected += 0.5 * math.exp(-(49 + 9 + 25) / 4) - 0.2 * math.exp(-(16 + 49 + 25))
+    assert float(signals.franke()(torch.zeros(3, dtype=torch.float64))) == pytest.approx(expected, rel=1e-14)
+
+
+def test_spheres():
+    p = torch.tensor([[0.6, 0, 0], [0, 0, 0], [0, 1.0, 0]], dtype=torch.float64)
+    laws.assert_close(signals.sphere()(p), np.array([0.5, 1, 0]), 1e-8)
+    laws.assert_close(signals.sphere_distance()(p), np.array([0, -0.6, 0.4]), 1e-14)
+    moved = signals.sphere_distance(center=(0.6, 0, 0))
+    laws.assert_close(moved(p), np.array([-0.6, 0, math.sqrt(1.36) - 0.6]), 1e-14)
+
+
+def test_polynomial_with_gradient():
+    terms = {(0, 0, 0): 1.0, (1, 2, 0): 2.0, (0, 0, 3): -0.5}
+    p = torch.rand(20, 3, dtype=torch.float64)
+    x, y, z = p.unbind(-1)
+    value, gradient = signals.polynomial(terms).value_and_gradient(p)
+    laws.assert_close(value, 1 + 2 * x * y**2 - 0.5 * z**3, 1e-14)
+    laws.assert_close(gradient, torch.stack([2 * y**2, 4 * x * y, -1.5 * z**2], -1), 1e-14)
+
+
+def test_gradcheck_through_value_gradient_and_hessian():
+    p = (0.1 + 0.7 * torch.rand(2, 3, dtype=torch.float64)).requires_grad_()
+    for name in ("marschner-lobb", "gaussian"):
+        signal = signals.named(name)
+        assert torch.autograd.gradcheck(lambda q, signal=signal: signal.jet(q, 2), (p,))
+
+
+@every_signal
+def test_shapes_dtypes_and_voxel_size(name):
+    signal = signals.named(name)
+    value, gradient = signal.value_and_gradient(torch.rand(2, 4, 3))
+    assert (value.shape, gradient.shape, value.dtype) == ((2, 4), (2, 4, 3), torch.float32)
+    assert signal(torch.zeros(3, dtype=torch.int64)).dtype == torch.float32
+    assert signal.with_voxel_size(0.25).domain.voxel_size == 0.25
+    assert "voxel_size" in inspect.signature(signals.SIGNALS[name]).parameters
+
+
+def test_callers_mistakes():
+    with pytest.raises(ValueError, match="marschner-lobb, franke"):
+        signals.named("lobb")
+    signal = signals.gaussian()
+    with pytest.raises(ValueError, match=r"\(\.\.\., 3\).*\(5, 2\)"):
+        signal(torch.zeros(5, 2))
+    with pytest.raises(ValueError, match="order"):
+        signal.jet(torch.zeros(5, 3), 3)
+    with pytest.raises(ValueError, match="n must be"):
+        signal.sample(0)
+    with pytest.raises(ValueError, match="n must be"):
+        signal.sample(1, centering="node")
+    with pytest.raises(ValueError, match="centering"):
+        signal.sample(4, centering="corner")  # type: ignore[arg-type]
