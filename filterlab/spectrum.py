@@ -7,6 +7,7 @@ radians per voxel, the Nyquist frequency is π. An ideal reconstruction has the 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from filterlab import prefilters
 from filterlab.fields.base import Field
 from filterlab.kernels import PiecewisePolynomial
 from filterlab.methods import Method, as_method, reconstruct
+from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary
 
 NODES = 16  # Gauss-Legendre nodes per half voxel: exact to rounding for a kernel's piece times e^{−iωx}, |ω| ≤ 8π
@@ -93,58 +95,58 @@ def _mean_over_a_voxel(field: Field, x: Tensor) -> Tensor:
 def smoothing(method: str | Method | PiecewisePolynomial, prefilter: bool = True, dimensions: int = 1) -> float:
     """S = 1 − |R_N|⁻¹ ∫_{R_N} |ĥ|² dω over the Nyquist region R_N = [−π, π]^d: 0 for the ideal filter.
 
-    Source: Marschner & Lobb 1994, section 3. In three dimensions ncrsi, not being separable, is integrated in full.
+    d = `dimensions`, 1 (along an axis) or 3. Source: Marschner & Lobb 1994, section 3.
     """
-    _check_dimensions(dimensions)
-    return 1 - _passband_energy(as_method(method), prefilter, dimensions)
+    return 1 - _energy(as_method(method), prefilter, dimensions, _passband_integral)
 
 
 def postaliasing(method: str | Method | PiecewisePolynomial, prefilter: bool = True, dimensions: int = 1) -> float:
-    """P = |R_N|⁻¹ ∫_{outside R_N} |ĥ|² dω: 0 for the ideal filter (Marschner & Lobb 1994, section 3).
-
-    The integral over all ω is (2π)^d ∫ h² (Parseval), summed as Σ_k P²-weighted autocorrelation samples.
-    """
-    _check_dimensions(dimensions)
-    return _total_energy(as_method(method), prefilter, dimensions) - _passband_energy(
-        as_method(method), prefilter, dimensions
-    )
+    """P = |R_N|⁻¹ ∫_{outside R_N} |ĥ|² dω: 0 for the ideal filter (Marschner & Lobb 1994, section 3)."""
+    method = as_method(method)
+    total = _energy(method, prefilter, dimensions, _whole_integral)
+    return total - _energy(method, prefilter, dimensions, _passband_integral)
 
 
-def _check_dimensions(dimensions: int) -> None:
+AxisIntegral = Callable[[PiecewisePolynomial, PiecewisePolynomial, Prefilter], float]
+"""(p, q, prefilter) -> (2π)⁻¹ ∫ P(ω)² Φ_p(ω) Φ_q(ω) dω over some range of ω."""
+
+
+def _energy(method: Method, prefilter: bool, dimensions: int, integral: AxisIntegral) -> float:
+    """(2π)^−d ∫ |ĥ|² dω; for a sum of separable terms, the sum over pairs of terms of products over axes."""
     if dimensions not in (1, 3):
         raise ValueError(f"dimensions must be 1 or 3; got {dimensions!r}")
-
-
-def _passband_energy(method: Method, prefilter: bool, dimensions: int) -> float:
-    """(2π)^−d ∫_{[−π, π]^d} |ĥ|² dω by Gauss-Legendre quadrature on [0, π] (ĥ is even along every axis)."""
-    t, w = np.polynomial.legendre.leggauss(48)
-    omega, weights = torch.tensor((t + 1) * math.pi / 2), torch.tensor(w / 2)
+    applied = method.prefilter if prefilter else prefilters.IDENTITY
     if dimensions == 1 or method.terms is None:
-        energy = float((axis_response(method, omega, prefilter) ** 2 * weights).sum())
-        return energy**dimensions
-    grid = torch.stack(torch.meshgrid(omega, omega, omega, indexing="ij"), -1)
-    return float(torch.einsum("xyz,x,y,z->", response(method, grid, prefilter) ** 2, weights, weights, weights))
-
-
-def _total_energy(method: Method, prefilter: bool, dimensions: int) -> float:
-    """(2π)^−d ∫ |ĥ|² dω = (2π)^−d ∫_{[−π, π]^d} P(ω)² A(ω) dω, A(ω) = Σ_k Φ(ω + 2πk)² = Σ_n (φ⋆φ)(n) cos(nω).
-
-    A is a trigonometric polynomial, so the mean over enough equidistant ω is exact.
-    """
-    omega = torch.arange(256, dtype=torch.float64) * (2 * math.pi / 256)
-    squared = (method.prefilter if prefilter else prefilters.IDENTITY).response(omega) ** 2
-    if dimensions == 1 or method.terms is None:
-        axis = float((squared * _correlation_spectrum(method.kernel, method.kernel, omega)).mean())
-        return axis**dimensions
+        return integral(method.kernel, method.kernel, applied) ** dimensions
+    known: dict[tuple[int, int], float] = {}
     total = 0.0
     for a in method.terms:
         for b in method.terms:
-            factors = [
-                float((squared * _correlation_spectrum(p, q, omega)).mean())
-                for p, q in zip(a.kernels, b.kernels, strict=True)
-            ]
-            total += a.weight * b.weight * math.prod(factors)
+            product = a.weight * b.weight
+            for p, q in zip(a.kernels, b.kernels, strict=True):
+                key = (id(p), id(q))
+                if key not in known:
+                    known[key] = integral(p, q, applied)
+                product *= known[key]
+            total += product
     return total
+
+
+def _passband_integral(p: PiecewisePolynomial, q: PiecewisePolynomial, prefilter: Prefilter) -> float:
+    """Over [−π, π], by Gauss-Legendre quadrature on [0, π] (everything is even)."""
+    t, w = np.polynomial.legendre.leggauss(48)
+    omega, weights = torch.tensor((t + 1) * math.pi / 2), torch.tensor(w / 2)
+    product = kernel_response(p, omega) * kernel_response(q, omega) * prefilter.response(omega) ** 2
+    return float((product * weights).sum())
+
+
+def _whole_integral(p: PiecewisePolynomial, q: PiecewisePolynomial, prefilter: Prefilter) -> float:
+    """Over all ω: the mean over [−π, π] of P(ω)² A(ω), A(ω) = Σ_k Φ_p Φ_q(ω + 2πk) = Σ_n cos(nω) ∫ p(x) q(x + n) dx.
+
+    The mean of a smooth periodic function over 256 equidistant ω is exact to rounding.
+    """
+    omega = torch.arange(256, dtype=torch.float64) * (2 * math.pi / 256)
+    return float((prefilter.response(omega) ** 2 * _correlation_spectrum(p, q, omega)).mean())
 
 
 def _correlation_spectrum(p: PiecewisePolynomial, q: PiecewisePolynomial, omega: Tensor) -> Tensor:

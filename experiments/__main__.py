@@ -1,0 +1,256 @@
+"""python -m experiments list | run CONFIG [--field value …] | report RUN"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import shlex
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from experiments.config import known_configs
+from experiments.registry import Experiment, experiment_of, load
+from experiments.report.page import write_report
+from experiments.runs import Run, RunError, Unit, provenance, run_folder
+from filterlab.io import VolumeFileError
+from filterlab.io.config import ConfigError
+
+OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+OWN_OPTIONS = ("--fresh", "--runs", "--help")
+
+USAGE_TEXT = """
+  python -m experiments list
+  python -m experiments run CONFIG [--field value …] [--fresh] [--runs DIR]
+  python -m experiments report RUN"""
+
+EXAMPLES = """examples:
+  python -m experiments run demo
+  python -m experiments run rms_error --points 10000 --methods.0 notch
+  python -m experiments run rms_error --studies.0.resolutions '[8, 16, 32]'
+  python -m experiments report runs/demo-0123456789
+
+CONFIG is a YAML file or the bare name of one in configs/. Any field of it can be changed by its dotted path; the new
+value is read as YAML. An interrupted run goes on where it stopped when the same command is given again."""
+
+
+class UsageError(ValueError):
+    """A command line that makes no sense."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command; returns its exit code: 0 done, 1 failed, 2 wrong usage or config, 130 interrupted."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        known, overrides = split_overrides(arguments)
+        options = _parser().parse_args(known)
+        if overrides and options.command != "run":
+            raise UsageError(f"only `run` takes fields of a config; got --{next(iter(overrides))}")
+        match options.command:
+            case "list":
+                return _list()
+            case "run":
+                return _run(options, overrides, arguments)
+            case _:
+                return _report(options.run)
+    except (ConfigError, UsageError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return USAGE
+    except (RunError, VolumeFileError, OSError) as error:
+        print(f"error: {_explained(error)}", file=sys.stderr)
+        return FAILED
+
+
+def split_overrides(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
+    """Our own words, and {dotted path: YAML text} of every other `--field value` or `--field=value`."""
+    known: list[str] = []
+    overrides: dict[str, str] = {}
+    rest = iter(arguments)
+    for word in rest:
+        name, equals, value = word.partition("=")
+        if not word.startswith("--") or name in OWN_OPTIONS:
+            known.append(word)
+            continue
+        if not equals:
+            value = next(rest, None)
+            if value is None or value.startswith("--"):
+                raise UsageError(f"{word} needs a value, as in {word} VALUE")
+        if name.removeprefix("--") in overrides:
+            raise UsageError(f"{name} is given twice")
+        overrides[name.removeprefix("--")] = value
+    return known, overrides
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments",
+        usage=USAGE_TEXT,
+        description="Experiments of filterlab: compute records, resume when interrupted, draw one HTML report.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="list | run | report", prog="python -m experiments"
+    )
+    commands.add_parser("list", help="the configs there are, with what each shows")
+    run = commands.add_parser(
+        "run",
+        help="run a config (or go on with it) and write its report",
+        description="Runs a config, or goes on with it, and writes its report.",
+        usage="python -m experiments run CONFIG [--field value …] [--fresh] [--runs DIR]",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    run.add_argument("config", metavar="CONFIG", help="a YAML file, or the bare name of one in configs/")
+    run.add_argument("--fresh", action="store_true", help="begin anew in a folder of its own, keeping the old one")
+    run.add_argument("--runs", type=Path, default=Path("runs"), metavar="DIR", help="where run folders go")
+    report = commands.add_parser("report", help="draw the report of a run folder again")
+    report.add_argument("run", metavar="RUN", type=Path, help="a run folder, e.g. runs/demo-0123456789")
+    return parser
+
+
+def _list() -> int:
+    configs = known_configs()
+    width = max(map(len, configs), default=0)
+    for name, path in configs.items():
+        print(f"{name:<{width}}  {experiment_of(path)[1].description}")
+    return OK
+
+
+def _run(options: argparse.Namespace, overrides: dict[str, str], arguments: list[str]) -> int:
+    name, experiment, config = load(options.config, overrides)
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    folder = run_folder(options.runs, name, config, fresh=options.fresh)
+    command = shlex.join(["python", "-m", "experiments", *(a for a in arguments if a != "--fresh")])
+    with Run.open(folder, config, provenance(config.device, config.seed, command)) as run:
+        units = experiment.units(config)
+        left = [unit for unit in units if not run.done(unit.key)]
+        _announce(name, config.description, units, left, folder)
+        try:
+            _work(experiment, config, run, units, left)
+        except KeyboardInterrupt:
+            done = sum(run.done(unit.key) for unit in units)
+            print(f"\nstopped; {done} of {len(units)} are done and kept. Go on with:\n  {command}", file=sys.stderr)
+            return INTERRUPTED
+    print(f"report: {write_report(folder)}")
+    return OK
+
+
+def _announce(name: str, description: str, units: list[Unit], left: list[Unit], folder: Path) -> None:
+    print(f"{name}: {description}", file=sys.stderr)
+    print(f"folder: {folder}", file=sys.stderr)
+    if not left:
+        print(f"all {len(units)} units of work are done already; --fresh does them again", file=sys.stderr)
+        return
+    done = len(units) - len(left)
+    kept = f"{done} of {len(units)} units of work are done already; " if done else ""
+    expected = _duration(sum(unit.seconds for unit in left))
+    print(f"{kept}{len(left)} to do, about {expected} on two cores", file=sys.stderr)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{max(round(seconds), 1)} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _work(experiment: Experiment, config: Any, run: Run, units: list[Unit], left: list[Unit]) -> None:
+    with _shown_progress(run, units, left) as shown:
+        for unit in left:
+            shown.begin(unit)
+            start = time.perf_counter()
+            record = experiment.compute(config, unit, run)
+            run.append(unit.key, {**record, "seconds": time.perf_counter() - start})
+            shown.end(unit)
+
+
+@contextmanager
+def _shown_progress(run: Run, units: list[Unit], left: list[Unit]) -> Iterator[_Lines | _Bar]:
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _Lines(len(units), left)
+        return
+    progress = Progress(
+        TextColumn("{task.fields[units]}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+        console=console,
+    )
+    with progress:
+        bar = _Bar(progress, len(units), left)
+        run.on_advance(bar.advance)
+        yield bar
+
+
+class _Bar:
+    """A progress bar with time left, for terminals."""
+
+    def __init__(self, progress: Progress, total: int, left: list[Unit]) -> None:
+        self._progress, self._total, self._done = progress, total, total - len(left)
+        self._finished, self._unit = 0.0, 0.0
+        self._task = progress.add_task("", total=sum(u.seconds for u in left), units=self._count())
+
+    def _count(self) -> str:
+        return f"{self._done}/{self._total}"
+
+    def begin(self, unit: Unit) -> None:
+        self._unit = unit.seconds
+        self._progress.update(self._task, description=unit.label)
+
+    def advance(self, fraction: float) -> None:
+        self._progress.update(self._task, completed=self._finished + fraction * self._unit)
+
+    def end(self, unit: Unit) -> None:
+        self._done += 1
+        self._finished += unit.seconds
+        self._progress.update(self._task, completed=self._finished, units=self._count())
+
+
+class _Lines:
+    """A line now and then, for log files."""
+
+    def __init__(self, total: int, left: list[Unit], every: float = 10.0) -> None:
+        self._total, self._done, self._every = total, total - len(left), every
+        self._expected, self._finished = sum(u.seconds for u in left), 0.0
+        self._start = self._said = time.monotonic()
+
+    def begin(self, unit: Unit) -> None:
+        pass
+
+    def end(self, unit: Unit) -> None:
+        self._done += 1
+        self._finished += unit.seconds
+        now = time.monotonic()
+        if now - self._said >= self._every:
+            self._said = now
+            left = (now - self._start) / self._finished * (self._expected - self._finished)
+            print(f"{self._done} of {self._total} done, about {_duration(left)} left", file=sys.stderr, flush=True)
+
+
+def _report(folder: Path) -> int:
+    print(f"report: {write_report(folder)}")
+    return OK
+
+
+def _explained(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        kept = "what was finished is kept: free some space and give the same command again"
+        return f"the disk is full ({error.strerror}); {kept}"
+    return str(error)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

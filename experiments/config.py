@@ -1,0 +1,315 @@
+"""Typed, validated experiment configs: what they share, and how a config file is found and read."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Iterable
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+import filterlab as fl
+from filterlab import signals
+from filterlab.io import describe, load_volume
+from filterlab.io.config import ConfigError, Problem, StrictModel, load_config, unknown_name
+from filterlab.render.scene import find_volume
+
+CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+
+
+def _known_method(name: str) -> str:
+    if name not in fl.METHODS:
+        raise ValueError(unknown_name("method", name, fl.METHODS))
+    return name
+
+
+def _known_signal(name: str) -> str:
+    if name not in signals.SIGNALS:
+        raise ValueError(unknown_name("signal", name, signals.SIGNALS))
+    return name
+
+
+MethodName = Annotated[str, AfterValidator(_known_method)]
+SignalName = Annotated[str, AfterValidator(_known_signal)]
+Dtype = Literal["float32", "float64"]
+BoundaryName = Literal["mirror", "reflect", "wrap", "border", "zeros"]
+
+
+class Recipe(StrictModel):
+    """How a volume is reconstructed. A bare method name stands for its defaults."""
+
+    method: MethodName
+    prefilter: bool = True
+    gradient: Literal["analytic", "central"] | None = None
+    scheme: Literal["direct", "eight_trilinear"] = "direct"
+    sampler: Literal["exact", "texture_unit"] = "exact"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"method": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _offered(self) -> Recipe:
+        method = fl.METHODS[self.method]
+        if not self.prefilter and not method.facts.prefiltered:
+            raise ValueError(f"{self.method} has no prefilter to leave out; remove prefilter: false")
+        method.scheme(self.scheme, self.gradient, self.sampler)
+        return self
+
+    @property
+    def gradient_kind(self) -> str:
+        """`analytic` or `central`: what is used, the method's default where none is asked for."""
+        method = fl.METHODS[self.method]
+        default = method.gradients[0] if self.scheme == "direct" else method.sampled_gradient
+        return self.gradient or default
+
+    @property
+    def declared_order(self) -> int:
+        """The approximation order that the method declares, with or without its prefilter."""
+        facts = fl.METHODS[self.method].facts
+        return facts.approximation_order if self.prefilter else facts.approximation_order_without_prefilter
+
+    @property
+    def key(self) -> str:
+        """A short unique name for records and files, e.g. `triquadratic+unprefiltered`."""
+        facts = fl.METHODS[self.method].facts
+        parts = [
+            self.method,
+            "" if self.prefilter else "unprefiltered",
+            "" if self.gradient_kind == facts.gradients[0] else self.gradient_kind,
+            "" if self.scheme == "direct" else self.scheme,
+            "" if self.sampler == "exact" else self.sampler,
+        ]
+        return "+".join(p for p in parts if p)
+
+    def reconstruct(self, volume: fl.Volume, boundary: str = "mirror") -> fl.Field:
+        """The field of that recipe."""
+        return fl.reconstruct(
+            volume,
+            self.method,
+            boundary=boundary,
+            prefilter=self.prefilter,
+            gradient=self.gradient,
+            scheme=self.scheme,
+            sampler=self.sampler,
+        )
+
+    def record(self) -> dict[str, Any]:
+        """What a record says about the recipe, so that a report needs nothing else to label it."""
+        return {
+            "recipe": self.key,
+            "method": self.method,
+            "prefilter": self.prefilter,
+            "gradient": self.gradient_kind,
+            "scheme": self.scheme,
+            "sampler": self.sampler,
+            "default_gradient": self.gradient_kind == fl.METHODS[self.method].facts.gradients[0],
+        }
+
+
+def _distinct(recipes: list[Recipe]) -> list[Recipe]:
+    seen: set[str] = set()
+    for recipe in recipes:
+        if recipe.key in seen:
+            raise ValueError(f"{recipe.key} is listed twice")
+        seen.add(recipe.key)
+    return recipes
+
+
+Recipes = Annotated[list[Recipe], Field(min_length=1), AfterValidator(_distinct)]
+
+
+class SignalChoice(StrictModel):
+    """A signal by name, with its parameters. A bare name stands for the default parameters."""
+
+    name: SignalName
+    parameters: dict[str, float | list[float]] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _accepted(self) -> SignalChoice:
+        self.build()
+        return self
+
+    def build(self) -> signals.Signal:
+        """The signal."""
+        parameters = {k: tuple(v) if isinstance(v, list) else v for k, v in self.parameters.items()}
+        try:
+            return signals.named(self.name, **parameters)  # type: ignore[arg-type]
+        except TypeError as error:
+            known = signals.SIGNALS[self.name].__code__.co_varnames[: signals.SIGNALS[self.name].__code__.co_argcount]
+            raise ValueError(f"{self.name} takes {', '.join(known)}; {error}") from None
+
+    @property
+    def label(self) -> str:
+        """The name with its parameters, e.g. `gaussian (sigma 0.2)`."""
+        listed = ", ".join(f"{k} {v}" for k, v in self.parameters.items())
+        return f"{self.name} ({listed})" if listed else self.name
+
+
+class VolumeChoice(StrictModel):
+    """A volume file by name. A bare name stands for the file as it is.
+
+    Attributes:
+        file: a path, a file in the folder of $FILTERLAB_VOLUMES, or `package:path` (see `volume_path`).
+        frame: which volume of a NIfTI time series, which `load_volume` refuses as a whole.
+    """
+
+    file: Annotated[str, Field(min_length=1)]
+    frame: Annotated[int, Field(ge=0)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"file": value} if isinstance(value, str) else value
+
+    def check(self, path: str) -> None:
+        """Raises ConfigError for the key at `path` unless the file is there with a sound header; reads no voxels."""
+        try:
+            file = volume_path(self.file)
+            if self.frame is None:
+                describe(file)
+            else:
+                _time_series(file, self.frame)
+        except (ValueError, OSError, ImportError) as error:
+            raise ConfigError([Problem(self.file, path, str(error))]) from None
+
+    def extent(self) -> float:
+        """Voxels along an axis, the geometric mean of the three; 128 where the file can't be read here."""
+        try:
+            file = volume_path(self.file)
+            size = describe(file).shape if self.frame is None else _time_series(file, self.frame).shape[:3]
+        except (ValueError, OSError, ImportError):
+            return 128.0
+        return float(np.prod(np.asarray(size[-3:], dtype=np.float64)) ** (1 / 3))
+
+    def load(self) -> fl.Volume:
+        """The volume, with its geometry."""
+        file = volume_path(self.file)
+        if self.frame is None:
+            return load_volume(file)
+        series = _time_series(file, self.frame)
+        samples = np.asarray(series.dataobj[..., self.frame], dtype=np.float32)
+        return fl.Volume(torch.from_numpy(np.ascontiguousarray(samples.T)), affine=series.affine)
+
+
+def _time_series(path: Path, frame: int) -> Any:
+    """The NIfTI time series in a file, as nibabel's image. Raises ValueError unless it has that frame."""
+    import nibabel
+    from nibabel.filebasedimages import ImageFileError
+
+    try:
+        series: Any = nibabel.load(path)  # type: ignore[attr-defined]
+    except ImageFileError as error:
+        raise ValueError(f"expected a NIfTI time series; {error}") from None
+    if len(series.shape) != 4 or not frame < series.shape[3]:
+        raise ValueError(f"expected a time series with a frame {frame}; got the shape {series.shape}")
+    return series
+
+
+class ExperimentConfig(StrictModel):
+    """What every experiment's config has."""
+
+    experiment: str
+    description: Annotated[str, Field(min_length=1)]
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    device: str = "cpu"
+    threads: Annotated[int, Field(ge=1, le=1024)] | None = None
+
+
+def torch_dtype(name: Dtype) -> torch.dtype:
+    """The torch dtype of that name."""
+    return {"float32": torch.float32, "float64": torch.float64}[name]
+
+
+def increasing(numbers: Iterable[int]) -> list[int]:
+    """The numbers as a list. Raises ValueError unless they increase strictly."""
+    listed = list(numbers)
+    if any(b <= a for a, b in pairwise(listed)):
+        raise ValueError(f"expected increasing numbers; got {listed}")
+    return listed
+
+
+def volume_path(name: str) -> Path:
+    """The file that `name` stands for: a path, a file in the folder of $FILTERLAB_VOLUMES, or `package:path`.
+
+    `package:path` is a file that comes with an installed Python package (`nibabel:tests/data/example4d.nii.gz`).
+
+    Raises:
+        ValueError: there is no such file; the message lists where it was looked for.
+    """
+    package, colon, inside = name.partition(":")
+    if colon and package.isidentifier():
+        return _packaged(package, inside)
+    return find_volume(name, Path())
+
+
+def _packaged(package: str, inside: str) -> Path:
+    spec = importlib.util.find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        raise ValueError(f"expected the installed package {package!r}; it is not here (pip install {package})")
+    path = Path(spec.submodule_search_locations[0]) / inside
+    if not path.is_file():
+        raise ValueError(f"expected a file of the package {package}; it has no {inside!r}")
+    return path
+
+
+def known_configs(folder: Path = CONFIGS) -> dict[str, Path]:
+    """The config files of the project, by name."""
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def config_path(name: str) -> Path:
+    """The config file that `name` stands for: a path, or the bare name of a file in configs/.
+
+    Raises:
+        ConfigError: neither; the message lists the known names.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    configs = known_configs()
+    if name.removesuffix(".yaml") in configs:
+        return configs[name.removesuffix(".yaml")]
+    message = f"expected the path of a YAML file or one of the known configs: {', '.join(configs)}"
+    raise ConfigError([Problem(name, "", f"{message}; found neither")])
+
+
+class Heading(BaseModel):
+    """The two keys that every config file begins with; the rest depends on the experiment."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    experiment: str
+    description: Annotated[str, Field(min_length=1)]
+
+
+def load_heading(path: Path) -> Heading:
+    """Which experiment a config file is for, and its one-line description."""
+    return load_config(path, Heading, None)
+
+
+def check_device(name: str, path: str = "device") -> None:
+    """Raises ConfigError unless torch can compute on that device here."""
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError([Problem(name, path, f"expected a device that torch has here, like cpu; {reason}")]) from None
+
+
+def number(value: float | torch.Tensor) -> float | None:
+    """A plain number for a record; None where it is not finite (JSON has no infinity)."""
+    plain = float(value)
+    return plain if math.isfinite(plain) else None

@@ -1,0 +1,74 @@
+"""EXPERIMENTS: what the command, the tests and the demo know.
+
+An experiment is a module here with `Config`, `units`, `compute` (and `check`), and a module of the same name in
+`experiments.report` with `draw`. To add one: write both, add its name to `_NAMES`, add a config to configs/.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from experiments.config import Heading, check_device, config_path, load_heading
+from experiments.report.page import Section
+from experiments.runs import Record, Run, Unit
+from filterlab.io.config import ConfigError, Problem, load_config, unknown_name
+
+_NAMES = ("frequency_response", "rms_error", "dvr_signal", "dvr_volume", "texture_precision", "demo")
+
+
+def _nothing_to_check(_config: Any, _path: str = "") -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A question that can be asked of the lab.
+
+    Attributes:
+        name: the value of `experiment:` in a config file.
+        config: the model its configs are checked against.
+        units: config -> all units of work, in the order they are done; computes nothing.
+        compute: (config, unit, run) -> the record of that unit; may read records of earlier units from the run.
+        draw: (config, records by key, run folder) -> a section of the report; computes nothing.
+        check: (config, path of the config's keys) -> None; raises ConfigError where this machine lacks what the config
+            needs (a volume file).
+    """
+
+    name: str
+    config: type
+    units: Callable[[Any], list[Unit]]
+    compute: Callable[[Any, Unit, Run], Record]
+    draw: Callable[[Any, Mapping[str, Record], Path], Section]
+    check: Callable[[Any, str], None] = _nothing_to_check
+
+
+def _experiment(name: str) -> Experiment:
+    computing, drawing = (import_module(f"experiments.{part}{name}") for part in ("", "report."))
+    check = getattr(computing, "check", _nothing_to_check)
+    return Experiment(name, computing.Config, computing.units, computing.compute, drawing.draw, check)
+
+
+EXPERIMENTS: dict[str, Experiment] = {name: _experiment(name) for name in _NAMES}
+
+
+def experiment_of(path: Path) -> tuple[Experiment, Heading]:
+    """The experiment a config file is for. Raises ConfigError that lists the known experiments."""
+    heading = load_heading(path)
+    if heading.experiment not in EXPERIMENTS:
+        message = unknown_name("experiment", heading.experiment, EXPERIMENTS)
+        raise ConfigError([Problem(str(path), "experiment", message)])
+    return EXPERIMENTS[heading.experiment], heading
+
+
+def load(name: str, overrides: Mapping[str, str] | None = None) -> tuple[str, Experiment, Any]:
+    """Name, experiment and typed config of a config file, given by path or bare name, checked against this machine."""
+    path = config_path(name)
+    experiment, _ = experiment_of(path)
+    config = load_config(path, experiment.config, overrides)
+    check_device(config.device)
+    experiment.check(config, "")
+    return path.stem, experiment, config

@@ -1,0 +1,117 @@
+"""Section of `rms_error`: error curves of value and gradient, their numbers, and fitted orders beside declared ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from matplotlib.axes import Axes
+
+from experiments.report import plots
+from experiments.report.page import Block, Column, Plot, Section, Table
+from experiments.report.style import MISSING, fixed, label, line_style, text
+from experiments.runs import Record
+
+if TYPE_CHECKING:
+    from experiments.rms_error import Config, Study
+
+LEAD = (
+    "Each signal is sampled at cell centres on cubic grids, reconstructed, and compared with itself at uniform random "
+    "points; gradients are per world unit and compared as vectors. Away from the limit of resolution the error of a "
+    "method of order L falls as the L-th power of the voxel size: a straight line with that slope.",
+)
+
+
+def draw(config: Config, records: Mapping[str, Record], _folder: Path) -> Section:
+    """The section of the report."""
+    parts = [_study(config, study, i, records) for i, study in enumerate(config.studies)]
+    title = "Error of value and gradient against resolution"
+    if len(parts) == 1:
+        return Section(title, LEAD, parts[0].blocks)
+    return Section(title, LEAD, (), parts)
+
+
+def _study(config: Config, study: Study, index: int, records: Mapping[str, Record]) -> Section:
+    chosen = [r for r in records.values() if r["study"] == index]
+    errors = {(r["recipe"], r["resolution"]): r for r in chosen if r["kind"] == "error"}
+    fits = [r for r in chosen if r["kind"] == "fit"]
+    blocks: list[Block] = []
+    if errors:
+        blocks += [_curves(study, index, errors, config), _numbers(study, errors)]
+    if fits:
+        blocks.append(_orders(fits))
+    return Section(study.signal.label, (), blocks)
+
+
+def _curves(study: Study, index: int, errors: Mapping[tuple[str, int], Record], config: Config) -> Plot:
+    with plots.settings():
+        figure = plots.canvas(10.4, 4.6)
+        left, right = figure.subplots(1, 2)
+        _panel(left, study, errors, "value_rms", "RMS error of the value")
+        _panel(right, study, errors, "gradient_rms", "RMS error of the gradient")
+        plots.legend_right(right)
+        drawn = plots.svg(figure, f"rms-{index}")
+    caption = (
+        f"Signal {study.signal.label}, {config.points:,} uniform points of the box shrunk to {study.inner:g}, boundary "
+        f"{config.boundary}, {config.dtype}. Left: value. Right: gradient, per world unit."
+    )
+    if any(not r["prefilter"] for r in errors.values()):
+        caption += " Dashed and hollow: without the prefilter."
+    if any(not r["default_gradient"] for r in errors.values()):
+        caption += " Dotted, with wide rings: another kind of gradient than the method's own, with the same value."
+    return Plot(drawn, caption)
+
+
+def _panel(axes: Axes, study: Study, errors: Mapping[tuple[str, int], Record], quantity: str, title: str) -> None:
+    for recipe in _recipes(errors):
+        found = [errors[recipe, n] for n in study.resolutions if (recipe, n) in errors]
+        found = [r for r in found if r[quantity]]
+        if not found:
+            continue
+        x, y = [r["resolution"] for r in found], [r[quantity] for r in found]
+        axes.plot(x, y, label=label(found[0]), **line_style(found[0]))
+    plots.logarithmic(axes)
+    plots.resolution_axis(axes, study.resolutions)
+    axes.set_title(title)
+
+
+def _recipes(errors: Mapping[tuple[str, int], Record]) -> list[str]:
+    return list(dict.fromkeys(recipe for recipe, _ in errors))
+
+
+def _numbers(study: Study, errors: Mapping[tuple[str, int], Record]) -> Table:
+    columns = [Column("method", numeric=False)]
+    for n in study.resolutions:
+        columns += [Column(f"{n}³", "value"), Column("", "gradient")]
+    rows = []
+    for recipe in _recipes(errors):
+        found = [errors.get((recipe, n)) for n in study.resolutions]
+        name = label(next(r for r in found if r))
+        pairs = [(text(r["value_rms"]), text(r["gradient_rms"])) if r else (MISSING, MISSING) for r in found]
+        rows.append([name, *(cell for pair in pairs for cell in pair)])
+    return Table(columns, rows, "RMS errors of value and gradient (per world unit) at each resolution.")
+
+
+def _orders(fits: list[Record]) -> Table:
+    columns = [
+        Column("method", numeric=False),
+        Column("declared order"),
+        Column("fitted order", "value"),
+        Column("difference"),
+        Column("fitted order", "gradient"),
+        Column("gradient", numeric=False),
+    ]
+    rows = []
+    for fit in fits:
+        declared, value = fit["declared_order"], fit["value_order"]
+        difference = None if value is None else value - declared
+        rows.append(
+            [label(fit), str(declared), fixed(value), fixed(difference), fixed(fit["gradient_order"]), fit["gradient"]]
+        )
+    used = ", ".join(map(str, fits[0]["resolutions"]))
+    caption = (
+        f"Orders fitted by least squares to the resolutions {used}. An order is a statement about "
+        "the limit: it shows where the signal is resolved well, and not before."
+    )
+    return Table(columns, rows, caption)

@@ -1,0 +1,197 @@
+"""What do a texture unit's 8-bit fractions cost?
+
+Graphics hardware rounds the fractions of a trilinear sample to 1/256. The eight-trilinear scheme rests on such samples,
+so its value and gradient inherit the rounding. Here it is measured against the direct sum in float64:
+
+    float64 eight samples     the scheme itself: rounding errors of float64
+    float32 direct            what float32 costs
+    float32 eight samples     what float32 costs this scheme
+    float32 8-bit fractions   what a texture unit gives
+
+Errors of the value are relative to the range of the samples; errors of the gradient to the RMS length of the gradient.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+import filterlab as fl
+from experiments.config import (
+    BoundaryName,
+    ExperimentConfig,
+    MethodName,
+    Recipe,
+    SignalChoice,
+    VolumeChoice,
+    number,
+)
+from experiments.dvr_signal import amplified_difference, image_errors
+from experiments.rms_error import evaluate, uniform_points
+from experiments.runs import Record, Run, RunError, Unit
+from experiments.views import View
+from filterlab import metrics
+from filterlab.io.config import StrictModel
+
+VARIANTS: dict[str, tuple[torch.dtype, str, str]] = {
+    "float64 eight samples": (torch.float64, "eight_trilinear", "exact"),
+    "float32 direct": (torch.float32, "direct", "exact"),
+    "float32 eight samples": (torch.float32, "eight_trilinear", "exact"),
+    "float32 8-bit fractions": (torch.float32, "eight_trilinear", "texture_unit"),
+}
+STEEP = 0.01  # directions are compared where the gradient is longer than this part of the longest
+
+
+class Source(StrictModel):
+    """What is reconstructed: a signal at a resolution, or a volume file; and a view, if images are to be compared."""
+
+    title: str
+    signal: SignalChoice | None = None
+    resolution: Annotated[int, Field(ge=2, le=1024)] | None = None
+    volume: VolumeChoice | None = None
+    view: View | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Source:
+        if (self.signal is None) == (self.volume is None):
+            raise ValueError("expected either signal and resolution, or volume")
+        if (self.signal is None) != (self.resolution is None):
+            raise ValueError("expected signal and resolution together")
+        return self
+
+    def extent(self) -> float:
+        """Voxels along an axis."""
+        return self.volume.extent() if self.volume is not None else float(self.resolution or 1)
+
+    def load(self, device: str) -> fl.Volume:
+        """The samples, float64."""
+        if self.signal is not None and self.resolution is not None:
+            return self.signal.build().sample(self.resolution, device=device)
+        assert self.volume is not None
+        return self.volume.load().to(torch.float64).to(device)
+
+
+class Config(ExperimentConfig):
+    """Precision of the eight-trilinear scheme, for some methods and sources.
+
+    Points are drawn from the box shrunk to `inner`, so that the ends of a signal do not hide its reconstruction.
+    """
+
+    experiment: Literal["texture_precision"]
+    sources: Annotated[list[Source], Field(min_length=1)]
+    methods: Annotated[list[MethodName], Field(min_length=1)]
+    image_methods: list[MethodName] = Field(default_factory=list)
+    boundary: BoundaryName = "mirror"
+    points: Annotated[int, Field(ge=10, le=10**8)] = 50_000
+    inner: Annotated[float, Field(gt=0, le=1)] = 0.8
+    amplify: Annotated[float, Field(gt=0)] = 50.0
+
+    @model_validator(mode="after")
+    def _sampled(self) -> Config:
+        for name in [*self.methods, *self.image_methods]:
+            if "eight_trilinear" not in fl.METHODS[name].facts.schemes:
+                offering = [m for m, method in fl.METHODS.items() if "eight_trilinear" in method.facts.schemes]
+                raise ValueError(f"{name} offers no scheme eight_trilinear; {', '.join(offering)} do")
+        if any(len(set(names)) < len(names) for names in (self.methods, self.image_methods)):
+            raise ValueError("expected every method once")
+        return self
+
+
+def check(config: Config, path: str = "") -> None:
+    """Raises ConfigError unless the volume files are there and sound."""
+    for i, source in enumerate(config.sources):
+        if source.volume is not None:
+            source.volume.check(f"{path}sources[{i}].volume")
+
+
+def units(config: Config) -> list[Unit]:
+    """Per source: one per method, then one per pair of images."""
+    work = []
+    for i, source in enumerate(config.sources):
+        seconds = 0.5 + config.points * 1e-4
+        work += [Unit(f"{i}/points/{name}", f"{source.title}, {name}", seconds) for name in config.methods]
+        if source.view is not None:
+            seconds = 2 * source.view.seconds(source.extent())
+            work += [
+                Unit(f"{i}/image/{name}", f"{source.title}, {name}: images", seconds) for name in config.image_methods
+            ]
+    return work
+
+
+def compute(config: Config, unit: Unit, run: Run) -> Record:
+    """The record of one unit."""
+    index, what, name = unit.key.split("/")
+    source = config.sources[int(index)]
+    volume = run.memo(f"volume:{index}", lambda: source.load(config.device))
+    common = {"source": int(index), "kind": what, **_recipe(name, "eight_trilinear", "exact").record()}
+    if what == "points":
+        return {**common, **_precision(config, source, volume, name)}
+    return {**common, **_images(config, source, volume, name, run)}
+
+
+def _recipe(method: str, scheme: Any, sampler: Any) -> Recipe:
+    """The recipe with the kind of gradient that the sampled scheme has, whatever the scheme."""
+    return Recipe(method=method, gradient=fl.METHODS[method].sampled_gradient, scheme=scheme, sampler=sampler)  # type: ignore[arg-type]
+
+
+def _precision(config: Config, source: Source, volume: fl.Volume, name: str) -> Record:
+    reference = _recipe(name, "direct", "exact").reconstruct(volume, config.boundary)
+    # points that float32 holds exactly, so that every variant is asked at the same ones
+    points = uniform_points(reference, config.points, config.inner, config.seed, torch.float32, config.device).double()
+    value, gradient = evaluate(reference, points)
+    scale = float(volume.samples.max() - volume.samples.min())
+    length = float(gradient.square().sum(-1).mean().sqrt())
+    if not (scale > 0 and length > 0):
+        raise RunError(f"{source.title}: expected samples that vary; all are {float(volume.samples.max())}")
+    variants = {}
+    for variant, (dtype, scheme, sampler) in VARIANTS.items():
+        field = _recipe(name, scheme, sampler).reconstruct(volume.to(dtype), config.boundary)
+        v, g = (t.double() for t in evaluate(field, points.to(dtype)))
+        variants[variant] = _errors(v, value, scale) | _gradient_errors(g, gradient, length)
+    record: Record = {"variants": variants, "range": scale, "gradient_length": length, "points": config.points}
+    if source.signal is not None:
+        truth_value, truth_gradient = evaluate(source.signal.build(), points)
+        record["method_error"] = _errors(value, truth_value, scale) | _gradient_errors(gradient, truth_gradient, length)
+    return record
+
+
+def _errors(value: Tensor, reference: Tensor, scale: float) -> Record:
+    return {
+        "value_rms": number(metrics.rms(value, reference) / scale),
+        "value_max": number(metrics.max_error(value, reference) / scale),
+    }
+
+
+def _gradient_errors(gradient: Tensor, reference: Tensor, length: float) -> Record:
+    lengths = reference.norm(dim=-1)
+    angle = metrics.angular_error(gradient, reference)[lengths > STEEP * lengths.max()]
+    angle = angle[angle.isfinite()]
+    return {
+        "gradient_rms": number(metrics.rms(gradient, reference, vectors=True) / length),
+        "gradient_max": number(metrics.max_error(gradient, reference, vectors=True) / length),
+        "angle_mean": number(math.degrees(angle.mean())),
+        "angle_max": number(math.degrees(angle.max())),
+    }
+
+
+def _images(config: Config, source: Source, volume: fl.Volume, name: str, run: Run) -> Record:
+    assert source.view is not None
+    single = volume.to(torch.float32)
+    fields = [
+        _recipe(name, "eight_trilinear", sampler).reconstruct(single, config.boundary)
+        for sampler in ("exact", "texture_unit")
+    ]
+    exact, rounded = (source.view.draw(field, run, config.device, "float32") for field in fields)
+    stem = f"{config.sources.index(source)}-{name}"
+    files = {
+        "exact": run.save_image(f"{stem}-exact", exact),
+        "rounded": run.save_image(f"{stem}-rounded", rounded),
+        "difference": run.save_image(
+            f"{stem}-difference", amplified_difference(rounded, exact, config.amplify), srgb=False
+        ),
+    }
+    return {**files, "files": list(files.values()), **image_errors(rounded, exact)}

@@ -1,0 +1,88 @@
+"""A view: everything an image needs but the field. Its sections are those of scene files (`filterlab.render.scene`)."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import torch
+from pydantic import AfterValidator, Field, model_validator
+from torch import Tensor
+
+import filterlab as fl
+from experiments.config import Dtype, torch_dtype
+from experiments.runs import Run
+from filterlab.io.config import StrictModel
+from filterlab.render import scene
+from filterlab.render.dvr import render
+
+SECONDS_PER_SAMPLE = 3e-7  # of plain torch on two cores, for views that are mostly empty; only expectations use it
+
+
+def _part(window: list[float]) -> list[float]:
+    left, top, right, bottom = window
+    if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
+        raise ValueError(f"expected left, top, right, bottom with 0 ≤ left < right ≤ 1, likewise down; got {window}")
+    if abs((right - left) - (bottom - top)) > 1e-6:
+        raise ValueError(f"expected the same part of the width as of the height, so that the shape stays; got {window}")
+    return window
+
+
+Window = Annotated[list[float], Field(min_length=4, max_length=4), AfterValidator(_part)]
+
+
+class View(StrictModel):
+    """Camera, transfer function, lights and sampling of an image; each as in a scene file.
+
+    Attributes:
+        size: (width, height) in pixels.
+        step: in voxels.
+        camera, transfer, lighting, region, background, termination: as in a scene; `transfer.axis` is always raw here.
+    """
+
+    size: tuple[scene.Pixels, scene.Pixels] = (512, 512)
+    step: scene.Positive = 0.5
+    camera: scene.View = scene.View()
+    transfer: scene.Transfer
+    lighting: scene.Lighting | None = None
+    region: scene.Region | None = None
+    background: scene.Color = (0.0, 0.0, 0.0)
+    termination: Annotated[float, Field(gt=0, lt=1)] | None = 0.002
+
+    @model_validator(mode="after")
+    def _raw(self) -> View:
+        if self.transfer.axis != "raw":
+            raise ValueError("transfer.axis: expected raw, so that all images of an experiment share the values")
+        return self
+
+    def through(self, window: list[float] | None) -> View:
+        """The part of this view in a window (left, top, right, bottom; 0 … 1 of this view), at full size."""
+        if window is None:
+            return self
+        left, top, right, bottom = self.camera.window
+        width, height = right - left, bottom - top
+        inner = (left + window[0] * width, top + window[1] * height, left + window[2] * width, top + window[3] * height)
+        return self.model_copy(update={"camera": self.camera.model_copy(update={"window": inner})})
+
+    def seconds(self, voxels: float) -> float:
+        """A rough expectation for an image of a volume with that many voxels along an axis."""
+        width, height = self.size
+        return width * height * voxels / self.step * SECONDS_PER_SAMPLE + 0.2
+
+    def draw(self, field: fl.Field, run: Run, device: str, dtype: Dtype) -> Tensor:
+        """The image of a field over the background, linear RGB `(H, W, 3)`, float32, on the CPU."""
+        with torch.no_grad():
+            image = render(
+                field,
+                self.camera.build(field.domain, self.size),
+                self.transfer.build(lambda: (0.0, 1.0), field.domain.voxel_size),
+                size=self.size,
+                step=self.step,
+                shading=self.lighting.build() if self.lighting else None,
+                background=self.background,
+                region=self.region.build() if self.region else None,
+                termination=self.termination,
+                dtype=torch_dtype(dtype),
+                device=device,
+                progress=lambda done, total: run.advance(done / max(total, 1)),
+            )
+        return image[..., :3].to(torch.float32).cpu()

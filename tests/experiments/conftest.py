@@ -1,0 +1,47 @@
+"""Tiny configs, written to files, and the command run in a process of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+TINY_RMS = """
+experiment: rms_error
+description: a tiny one
+seed: 3
+studies:
+  - {signal: {name: gaussian, parameters: {sigma: 0.5}}, resolutions: [4, 8], fit_from: 4}
+methods: [trilinear, notch, {method: notch, prefilter: false}]
+points: 50
+"""
+
+
+@pytest.fixture
+def tiny_rms(tmp_path):
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY_RMS)
+    return path
+
+
+@pytest.fixture
+def command():
+    """The `python -m experiments` process: arguments -> subprocess.Popen keywords -> Popen."""
+
+    def start(*arguments, code=None, **options):
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+        words = [sys.executable, "-c", code] if code else [sys.executable, "-m", "experiments"]
+        return subprocess.Popen(
+            [*words, *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+            cwd=ROOT,
+            **options,
+        )
+
+    return start

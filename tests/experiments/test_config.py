@@ -1,0 +1,109 @@
+"""Configs: what is refused, with the path of the key and the known names; and never with a traceback."""
+
+import pytest
+
+import filterlab as fl
+from experiments.__main__ import main, split_overrides
+from experiments.config import Recipe, known_configs, volume_path
+from experiments.registry import EXPERIMENTS, experiment_of, load
+from filterlab.io.config import ConfigError
+
+
+def refused(path, overrides=None):
+    with pytest.raises(ConfigError) as caught:
+        load(str(path), overrides)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", known_configs())
+def test_every_config_of_the_project_is_valid(name, monkeypatch, tmp_path):
+    path = known_configs()[name]
+    experiment, heading = experiment_of(path)
+    config = fl.io.config.load_config(path, experiment.config, None)
+    assert config.description == heading.description
+    units = experiment.units(config)
+    assert units
+    assert len({u.key for u in units}) == len(units)
+    assert all(u.seconds > 0 for u in units)
+
+
+def test_every_experiment_has_a_config():
+    assert {experiment_of(path)[0].name for path in known_configs().values()} == set(EXPERIMENTS)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "path", "words"),
+    [
+        ({"point": "5"}, "point", ["unknown key", "points"]),
+        ({"points": "many"}, "points", ["integer", "'many'"]),
+        ({"points": "1.5"}, "points", ["integer"]),
+        ({"methods.1": "noch"}, "methods[1]", ["unknown method 'noch'", *fl.METHODS]),
+        ({"methods.0.filter": "true"}, "methods[0]", []),
+        ({"studies.0.signal.name": "sombrero"}, "studies[0].signal.name", ["sombrero", "marschner-lobb"]),
+        ({"studies.0.signal.parameters.sigmoid": "1"}, "studies[0].signal", ["sigmoid", "sigma"]),
+        ({"studies.0.resolutions": "[8, 4]"}, "studies[0].resolutions", ["increasing"]),
+        ({"studies.0.fit_from": "8"}, "studies[0]", ["two resolutions"]),
+        ({"studies.0.extra": "1"}, "studies[0].extra", ["unknown key", "fit_from"]),
+        ({"boundary": "clamp"}, "boundary", ["mirror", "zeros"]),
+        ({"methods": "[notch, notch]"}, "methods", ["notch is listed twice"]),
+        ({"methods.0": "{method: ncrsi, prefilter: false}"}, "methods[0]", ["no prefilter"]),
+        ({"methods.0": "{method: notch, gradient: central}"}, "methods[0]", ["analytic"]),
+        ({"methods.0": "{method: mitchell, scheme: eight_trilinear}"}, "methods[0]", ["direct"]),
+        ({"methods.0": "{method: notch, sampler: texture_unit}"}, "methods[0]", ["eight_trilinear"]),
+        ({"device": "abacus"}, "device", ["cpu"]),
+        ({"experiment": "dvr_signal"}, "experiment", ["rms_error"]),
+    ],
+)
+def test_a_mistake_is_named_with_its_path(tiny_rms, overrides, path, words, capsys):
+    message = refused(tiny_rms, overrides)
+    assert f": {path}" in message
+    for word in words:
+        assert word in message
+    arguments = [word for key, value in overrides.items() for word in (f"--{key}", value)]
+    assert main(["run", str(tiny_rms), *arguments, "--runs", str(tiny_rms.parent / "runs")]) == 2
+    assert path in capsys.readouterr().err
+    assert not (tiny_rms.parent / "runs").exists()
+
+
+def test_an_unknown_experiment_or_config_lists_the_known(tmp_path):
+    path = tmp_path / "odd.yaml"
+    path.write_text("experiment: rms_eror\ndescription: x\n")
+    assert "rms_error" in refused(path)
+    assert all(name in refused("no-such-config") for name in known_configs())
+
+
+def test_overrides_reach_the_config(tiny_rms):
+    _, _, config = load(str(tiny_rms), {"methods.0": "tricubic", "studies.0.resolutions": "[5, 6, 7]"})
+    assert config.methods[0] == Recipe(method="tricubic")
+    assert config.studies[0].resolutions == [5, 6, 7]
+
+
+def test_overrides_are_told_from_our_own_options():
+    words = ["run", "--points", "-3", "demo", "--fresh", "--a.b=c=d", "--runs", "x"]
+    assert split_overrides(words) == (["run", "demo", "--fresh", "--runs", "x"], {"points": "-3", "a.b": "c=d"})
+
+
+@pytest.mark.parametrize("words", [["--points"], ["--points", "--fresh"], ["--points", "1", "--points", "2"]])
+def test_an_override_needs_one_value(words, capsys):
+    assert main(["run", "demo", *words]) == 2
+    assert "--points" in capsys.readouterr().err
+
+
+def test_a_recipe_knows_its_defaults():
+    assert Recipe.model_validate("ncrsi").gradient_kind == "central"
+    assert Recipe(method="trilinear", scheme="eight_trilinear").gradient_kind == "central"
+    assert Recipe(method="triquadratic").declared_order == 3
+    assert Recipe(method="triquadratic", prefilter=False).declared_order == 2
+
+
+def test_volume_files_are_found_by_name(tmp_path, monkeypatch):
+    (tmp_path / "scan.nrrd").write_bytes(b"x")
+    monkeypatch.setenv("FILTERLAB_VOLUMES", str(tmp_path))
+    assert volume_path("scan.nrrd") == tmp_path / "scan.nrrd"
+    assert volume_path("pydantic:main.py").is_file()
+    with pytest.raises(ValueError, match=r"found none at .*other\.nrrd"):
+        volume_path("other.nrrd")
+    with pytest.raises(ValueError, match=r"no 'scan\.nrrd'"):
+        volume_path("pydantic:scan.nrrd")
+    with pytest.raises(ValueError, match="pip install nonesuch"):
+        volume_path("nonesuch:scan.nrrd")

@@ -1,0 +1,242 @@
+"""Run folders: an interrupted run resumes where it stopped and loses nothing."""
+
+import json
+import signal
+import time
+
+import pytest
+import torch
+
+from experiments.__main__ import main
+from experiments.config import ExperimentConfig
+from experiments.runs import Run, RunError, config_hash, read_provenance, read_records, run_folder
+
+START = {"started": "2026-01-01T00:00:00+00:00"}
+
+
+class Config(ExperimentConfig):
+    """A config with nothing of its own."""
+
+    count: int = 4
+
+
+def config(**changes):
+    return Config(experiment="counting", description="counts", **changes)
+
+
+def opened(folder, **changes):
+    return Run.open(folder, config(**changes), START)
+
+
+# Units that take a while: killed in the middle, resumed, and never done twice.
+SLOW = """
+import sys, time
+from experiments import registry, __main__
+from experiments.report.page import Section
+from tests.experiments.test_runs import Config
+from experiments.runs import Unit
+
+def compute(config, unit, run):
+    with open(sys.argv[1], "a") as journal:
+        journal.write(unit.key + "\\n")
+    time.sleep(0.1)
+    import torch
+    return {"files": [run.save_array(unit.key, torch.arange(3.0))]}
+
+units = lambda config: [Unit(str(i), str(i)) for i in range(config.count)]
+registry.EXPERIMENTS["counting"] = registry.Experiment(
+    "counting", Config, units, compute, lambda *_: Section("counting"))
+sys.exit(__main__.main(sys.argv[2:]))
+"""
+
+
+@pytest.fixture
+def slow(tmp_path, command):
+    path = tmp_path / "slow.yaml"
+    path.write_text("experiment: counting\ndescription: counts slowly\ncount: 30\n")
+    journal = tmp_path / "journal"
+
+    def start(code=SLOW):
+        return command(journal, "run", path, "--runs", tmp_path / "runs", code=code)
+
+    return start, journal, tmp_path / "runs"
+
+
+def wait_for(journal, lines, process):
+    deadline = time.monotonic() + 60
+    while not journal.exists() or len(journal.read_text().splitlines()) < lines:
+        assert time.monotonic() < deadline
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_stopped_run_resumes_where_it_stopped(slow, how):
+    start, journal, runs = slow
+    process = start()
+    wait_for(journal, 4, process)
+    process.send_signal(how)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
+    if how == signal.SIGINT:
+        assert "Traceback" not in errors
+        assert "python -m experiments run" in errors
+    (folder,) = runs.iterdir()
+    kept, _ = read_records(folder)
+    assert 3 <= len(kept) < 30
+    before = (folder / "records.jsonl").read_bytes()
+    _, errors = start().communicate(timeout=60)
+    assert f"{len(kept)} of 30 units of work are done already" in errors
+    records, _ = read_records(folder)
+    assert list(records) == [str(i) for i in range(30)]
+    assert (folder / "records.jsonl").read_bytes().startswith(before[: before.rindex(b"\n") + 1])
+    done = journal.read_text().splitlines()
+    assert sorted(set(done), key=int) == [str(i) for i in range(30)]
+    assert len(done) <= 31  # at most the one that was cut off was begun twice
+    assert len(read_provenance(folder)) == 2
+    assert (folder / "report.html").is_file()
+    assert not list(folder.rglob(".tmp*"))
+
+
+def test_a_torn_last_line_is_cut_off_and_redone(tmp_path):
+    with opened(tmp_path / "run") as run:
+        for key in "abc":
+            run.append(key, {"x": 1})
+    path = tmp_path / "run" / "records.jsonl"
+    whole = path.read_bytes()
+    for cut in range(len(whole) - len(whole.splitlines()[-1]), len(whole)):
+        path.write_bytes(whole[:cut])
+        with opened(tmp_path / "run") as run:
+            assert [run.done(key) for key in "abc"] == [True, True, False]
+            run.append("c", {"x": 1})
+        assert path.read_bytes() == whole
+
+
+def test_damage_before_whole_records_is_not_thrown_away(tmp_path):
+    with opened(tmp_path / "run") as run:
+        run.append("a", {})
+        run.append("b", {})
+    path = tmp_path / "run" / "records.jsonl"
+    damaged = b'{"key": "a\n' + path.read_bytes().splitlines(keepends=True)[1]
+    path.write_bytes(damaged)
+    with pytest.raises(RunError, match="broken line"), opened(tmp_path / "run"):
+        pass
+    assert path.read_bytes() == damaged
+
+
+def test_a_record_whose_file_is_gone_is_not_done(tmp_path):
+    with opened(tmp_path / "run") as run:
+        name = run.save_array("numbers", torch.arange(4.0))
+        run.append("a", {"files": [name]})
+        assert run.done("a")
+        assert run.load_array(name).tolist() == [0, 1, 2, 3]
+        (run.folder / name).unlink()
+        assert not run.done("a")
+
+
+def test_images_survive_the_round_trip(tmp_path):
+    image = torch.rand(5, 7, 3, generator=torch.Generator().manual_seed(0))
+    with opened(tmp_path / "run") as run:
+        name = run.section("part").save_image("picture", image)
+        assert (run.load_image(name) - image).abs().max() < 0.02
+
+
+def test_sections_keep_their_records_apart(tmp_path):
+    with opened(tmp_path / "run") as run:
+        run.section("one").append("a", {"x": 1})
+        run.section("two").append("a", {"x": 2})
+        assert run.section("two").records["a"]["x"] == 2
+        assert not run.done("a")
+        assert set(run.records) == {"one/a", "two/a"}
+
+
+def test_memo_keeps_one_of_a_kind(tmp_path):
+    made = []
+    with opened(tmp_path / "run") as run:
+        for key in ("volume:8", "volume:8", "points:0", "volume:16", "points:0", "volume:8"):
+            run.memo(key, lambda key=key: made.append(key))
+    assert made == ["volume:8", "points:0", "volume:16", "volume:8"]
+
+
+def test_a_changed_config_gets_another_folder_and_fresh_a_new_one(tmp_path):
+    folder = run_folder(tmp_path, "x", config())
+    assert folder == run_folder(tmp_path, "x", config())
+    assert folder != run_folder(tmp_path, "x", config(count=5))
+    assert config_hash(config()) in folder.name
+    folder.mkdir()
+    assert run_folder(tmp_path, "x", config()) == folder
+    second = run_folder(tmp_path, "x", config(), fresh=True)
+    assert second.name == folder.name + "-2"
+    second.mkdir()
+    assert run_folder(tmp_path, "x", config()) == second
+    with opened(tmp_path / "y"):
+        pass
+    with pytest.raises(RunError, match="another config"), opened(tmp_path / "y", count=5):
+        pass
+
+
+def test_two_processes_do_not_share_a_folder(tmp_path):
+    with opened(tmp_path / "run"), pytest.raises(RunError, match="in use"), opened(tmp_path / "run"):
+        pass
+    with opened(tmp_path / "run"):
+        pass
+
+
+def test_what_makes_a_run_repeatable_is_written_down(tiny_rms, tmp_path):
+    assert main(["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]) == 0
+    (folder,) = (tmp_path / "runs").iterdir()
+    (start,) = read_provenance(folder)
+    assert start["seed"] == 3
+    assert start["device"] == "cpu"
+    assert start["threads"] == torch.get_num_threads()
+    assert start["torch"] == torch.__version__
+    assert {"filterlab", "commit", "numpy", "python"} <= set(start)
+    assert "boundary: reflect" in (folder / "config.yaml").read_text()  # a default, written out
+
+
+def test_a_finished_run_is_not_computed_again(tiny_rms, tmp_path, monkeypatch, capsys):
+    arguments = ["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]
+    assert main(arguments) == 0
+    (folder,) = (tmp_path / "runs").iterdir()
+    before = (folder / "records.jsonl").read_bytes()
+    assert len(before.splitlines()) == 3 * 2 + 3
+    assert main(arguments) == 0
+    assert "done already" in capsys.readouterr().err
+    assert (folder / "records.jsonl").read_bytes() == before
+    assert main([*arguments, "--fresh"]) == 0
+    assert len(list((tmp_path / "runs").iterdir())) == 2
+
+
+def test_a_folder_that_cannot_be_written_is_named(tiny_rms, tmp_path, capsys):
+    (tmp_path / "runs").write_text("a file")
+    assert main(["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]) == 1
+    message = capsys.readouterr().err
+    assert str(tmp_path / "runs") in message
+    assert "Traceback" not in message
+
+
+def test_a_full_disk_keeps_what_was_finished(slow):
+    """A limit on the size of files stands for the disk: writing fails in the middle of a record."""
+    start, _, runs = slow
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900)); sys.exit("
+    process = start(code=SLOW.replace("sys.exit(", limit))
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "the disk is full" in errors
+    assert "Traceback" not in errors
+    (folder,) = runs.iterdir()
+    kept = len(read_records(folder)[0])
+    assert 0 < kept < 30
+    process = start()
+    process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert len(read_records(folder)[0]) == 30
+
+
+def test_records_are_plain_json(tmp_path):
+    with opened(tmp_path / "run") as run:
+        run.append("a", {"words": "ω", "number": 0.1})
+        with pytest.raises(ValueError, match="JSON"):
+            run.append("b", {"number": float("inf")})
+    (line,) = (tmp_path / "run" / "records.jsonl").read_text().splitlines()
+    assert json.loads(line) == {"key": "a", "words": "ω", "number": 0.1}
