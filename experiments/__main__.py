@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from experiments.config import known_configs
 from experiments.registry import Experiment, experiment_of, load
-from experiments.report.page import write_report
+from experiments.report.write import write_report
 from experiments.runs import Run, RunError, Unit, provenance, run_folder
 from filterlab.io import VolumeFileError
 from filterlab.io.config import ConfigError

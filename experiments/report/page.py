@@ -12,9 +12,7 @@ import jinja2
 from markupsafe import Markup
 
 from experiments.report.plots import themed_colors
-from experiments.runs import Record, RunError, read_provenance, read_records
-from filterlab.io.atomic import atomic_write
-from filterlab.io.config import load_config
+from experiments.runs import Record
 
 TEMPLATE = "page.html.j2"
 
@@ -88,37 +86,6 @@ def picture(folder: Path, name: str, label: str, detail: str = "", boxes: Sequen
     """A picture from an image file that a record names."""
     content = base64.b64encode((folder / name).read_bytes()).decode()
     return Picture(f"data:image/png;base64,{content}", label, detail, boxes)
-
-
-def write_report(folder: Path) -> Path:
-    """Draws `report.html` in a run folder from what is recorded there, and returns its path.
-
-    Raises:
-        RunError: that is no run folder.
-    """
-    from experiments.registry import experiment_of  # the registry names the sections, the sections use this file
-
-    config_file = folder / "config.yaml"
-    if not config_file.is_file():
-        raise RunError(f"expected a run folder with a config.yaml in it; got {folder}")
-    experiment, _ = experiment_of(config_file)
-    config: Any = load_config(config_file, experiment.config, None)
-    records, _ = read_records(folder)
-    units = experiment.units(config)
-    page = render(
-        title=experiment.name.replace("_", " "),
-        config=config,
-        section=experiment.draw(config, records, folder),
-        done=sum(unit.key in records for unit in units),
-        total=len(units),
-        seconds=sum(record.get("seconds", 0.0) for record in records.values()),
-        config_text=config_file.read_text(),
-        starts=read_provenance(folder),
-    )
-    path = folder / "report.html"
-    with atomic_write(path) as temporary:
-        temporary.write_text(page)
-    return path
 
 
 def render(

@@ -10,7 +10,8 @@ import filterlab as fl
 from experiments import registry
 from experiments.__main__ import main
 from experiments.report import plots, style
-from experiments.report.page import Column, Gallery, Picture, Plot, Section, Table, render, write_report
+from experiments.report.page import Column, Gallery, Picture, Plot, Section, Table, render
+from experiments.report.write import write_report
 from experiments.runs import RunError
 from tests.experiments.test_runs import config
 
