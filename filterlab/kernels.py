@@ -345,7 +345,10 @@ _BC_TABLES = tuple(_from_halves((inner, outer)) for inner, outer in zip(_BC_INNE
 
 
 def _exactly(value: Rational) -> Fraction:
-    return Fraction(str(value)) if isinstance(value, float) else Fraction(value)
+    try:
+        return Fraction(value) if isinstance(value, int | Fraction) else Fraction(str(float(value)))
+    except (TypeError, ValueError):
+        raise ValueError(f"B and C must be finite numbers or tensors of no axes; got {value!r}") from None
 
 
 def bc(B: Rational | Tensor, C: Rational | Tensor, name: str | None = None) -> Kernel | TensorKernel:
@@ -358,6 +361,8 @@ def bc(B: Rational | Tensor, C: Rational | Tensor, name: str | None = None) -> K
     or C it is a `TensorKernel`, differentiable in them. B=1, C=0: cubic B-spline; B=0, C=½: Catmull-Rom.
     """
     if isinstance(B, Tensor) or isinstance(C, Tensor):
+        if any(isinstance(w, Tensor) and (w.ndim or not w.is_floating_point()) for w in (B, C)):
+            raise ValueError(f"B and C must be floating point tensors of no axes (0-d); got {B!r}, {C!r}")
         like = B if isinstance(B, Tensor) else C
         assert isinstance(like, Tensor)
         base, by_b, by_c = (

@@ -136,10 +136,10 @@ class Method:
         if gradient not in (None, *self.gradients):
             raise ValueError(f"method {self.name} offers the gradients {', '.join(self.gradients)}; got {gradient!r}")
         if name == "eight_trilinear":
-            if gradient not in (None, self.sampled_gradient):
+            if (gradient or self.gradients[0]) != self.sampled_gradient:
                 raise ValueError(
-                    f"eight_trilinear gives {self.name} the {self.sampled_gradient} gradient; "
-                    f"use scheme='direct' for gradient={gradient!r}"
+                    f"eight_trilinear gives {self.name} the {self.sampled_gradient} gradient: ask for "
+                    f"gradient={self.sampled_gradient!r}, or for scheme='direct'; got gradient={gradient!r}"
                 )
             assert self.sampled is not None
             return self.sampled(named_sampler(sampler))
@@ -254,7 +254,8 @@ def reconstruct(
             prefilter with which it does, a `TensorKernel` has none and needs prefilter=False.
         boundary: how the samples go on beyond the ends: mirror, reflect, wrap, border or zeros.
         prefilter: False to sum the samples themselves (blurs with a kernel that does not interpolate).
-        scheme: `direct` (default) or, where the method offers it, `eight_trilinear`.
+        scheme: `direct` (default) or, where the method offers it, `eight_trilinear` (for trilinear, whose gradient it
+            takes by central differences, together with gradient="central").
         gradient: `analytic` or `central`, where the method offers both; default: the method's own.
         sampler: for `eight_trilinear`: `exact`, `texture_unit` (8-bit fractions) or a callable.
 
@@ -267,6 +268,8 @@ def reconstruct(
     """
     if prefilter and isinstance(method, TensorKernel):
         raise ValueError(f"the kernel {method.name} is a TensorKernel and has no prefilter; pass prefilter=False")
+    if not isinstance(prefilter, bool):
+        raise TypeError(f"prefilter must be True or False; got {prefilter!r} (from_kernel pairs a kernel with another)")
     volume, method, boundary = as_volume(volume), as_method(method), Boundary.named(boundary)
     chosen = method.scheme(scheme, gradient, sampler)
     coefficients = Coefficients.of(

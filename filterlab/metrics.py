@@ -7,21 +7,24 @@ import torch
 from torch import Tensor
 
 
-def _same_shape(a: Tensor, b: Tensor) -> None:
+def _comparable(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Both as floating point of one type. Raises ValueError for different shapes."""
     if a.shape != b.shape:
         raise ValueError(f"both must have the same shape; got {tuple(a.shape)} and {tuple(b.shape)}")
+    dtype = torch.promote_types(torch.promote_types(a.dtype, b.dtype), torch.float32)
+    return a.to(dtype), b.to(dtype)
 
 
 def rms(a: Tensor, b: Tensor, vectors: bool = False) -> Tensor:
     """√mean |a − b|²; with vectors=True |·| is the length along the last axis (gradients)."""
-    _same_shape(a, b)
+    a, b = _comparable(a, b)
     squared = (a - b) ** 2
     return (squared.sum(-1) if vectors else squared).mean().sqrt()
 
 
 def max_error(a: Tensor, b: Tensor, vectors: bool = False) -> Tensor:
     """max |a − b|; with vectors=True |·| is the length along the last axis."""
-    _same_shape(a, b)
+    a, b = _comparable(a, b)
     return ((a - b).norm(dim=-1) if vectors else (a - b).abs()).max()
 
 
@@ -30,7 +33,7 @@ def angular_error(a: Tensor, b: Tensor) -> Tensor:
 
     Where either vector is zero the angle is NaN: it has no direction.
     """
-    _same_shape(a, b)
+    a, b = _comparable(a, b)
     angle = torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(-1))
     undefined = (a == 0).all(-1) | (b == 0).all(-1)
     return torch.where(undefined, torch.full_like(angle, torch.nan), angle)
@@ -40,7 +43,7 @@ def psnr(a: Tensor, b: Tensor, peak: float = 1.0) -> float:
     """Peak signal-to-noise ratio 20 log₁₀(peak / rms) in dB; infinite for equal images. Through kornia."""
     from kornia.metrics import psnr as kornia_psnr
 
-    _same_shape(a, b)
+    a, b = _comparable(a, b)
     return float(kornia_psnr(a.detach(), b.detach(), peak))
 
 
@@ -51,7 +54,7 @@ def ssim(a: Tensor, b: Tensor, peak: float = 1.0) -> float:
     """
     from skimage.metrics import structural_similarity
 
-    _same_shape(a, b)
+    a, b = _comparable(a, b)
     first, second = (np.asarray(t.detach().cpu(), dtype=np.float64) for t in (a, b))
     channels = -1 if a.ndim == 3 else None
     score = structural_similarity(

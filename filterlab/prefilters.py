@@ -91,10 +91,18 @@ def _poles_inside(factor: tuple[Fraction, ...]) -> list[float]:
 
 
 def interpolation(kernel: Kernel) -> Prefilter:
-    """The prefilter with which a kernel interpolates: the inverse of its integer samples (paper, eqs. 16-19)."""
+    """The prefilter with which a kernel interpolates: the inverse of its integer samples (paper, eqs. 16-19).
+
+    Raises ValueError for a kernel that is not symmetric, or whose integer samples do not sum to 1.
+    """
     if kernel.interpolating:
         return IDENTITY
     samples = kernel.integer_samples()
+    if not kernel.symmetric or sum(samples.values()) != 1:
+        listed = ", ".join(str(v) for v in samples.values())
+        raise ValueError(
+            f"a prefilter is derived for symmetric kernels whose integer samples sum to 1; {kernel.name} has ({listed})"
+        )
     reach = max(k for k, value in samples.items() if value)
     taps = tuple(samples[k] for k in range(reach + 1))
     return Prefilter(f"{kernel.name}-interpolation", (taps,))
@@ -109,6 +117,15 @@ QUINTIC = Prefilter("quintic", interpolation(bspline(5)).factors)
 NOTCH = Prefilter("notch", QUADRATIC.factors * 2)
 
 PREFILTERS: dict[str, Prefilter] = {p.name: p for p in (IDENTITY, QUADRATIC, CUBIC, QUARTIC, QUINTIC, NOTCH)}
+
+
+def named(prefilter: str | Prefilter) -> Prefilter:
+    """The prefilter of that name, or the prefilter itself. Raises ValueError that lists the known names."""
+    if isinstance(prefilter, Prefilter):
+        return prefilter
+    if prefilter not in PREFILTERS:
+        raise ValueError(f"unknown prefilter {prefilter!r}; known prefilters: {', '.join(PREFILTERS)}")
+    return PREFILTERS[prefilter]
 
 
 class _TwoSidedExponential(torch.autograd.Function):
@@ -149,19 +166,20 @@ def _two_sided_exponential(x: Tensor, pole: float) -> Tensor:
 
 
 def prefilter_axis(
-    samples: Tensor, dim: int, prefilter: Prefilter, boundary: str | Boundary = Boundary.MIRROR, tail: int = 0
+    samples: Tensor, dim: int, prefilter: str | Prefilter, boundary: str | Boundary = Boundary.MIRROR, tail: int = 0
 ) -> Tensor:
     """Coefficients along one axis.
 
     Args:
         samples: any shape, floating point.
         dim: the axis to filter.
+        prefilter: a name from `PREFILTERS` or a `Prefilter`.
         tail: coefficients to return beyond each end (border and zeros need them; see the head of this file).
 
     Returns:
         the coefficients, `samples.shape` with n + 2·tail along `dim`. Linear in the samples, with an exact adjoint.
     """
-    boundary = Boundary.named(boundary)
+    boundary, prefilter = Boundary.named(boundary), named(prefilter)
     warm_up = prefilter.decay(samples.dtype)
     lines = boundary.extend(samples, dim, tail + warm_up, tail + warm_up).movedim(dim, 0).contiguous()
     for pole in prefilter.poles:
@@ -169,7 +187,9 @@ def prefilter_axis(
     return lines[warm_up : lines.shape[0] - warm_up].movedim(0, dim)
 
 
-def prefilter_samples(samples: Tensor, prefilter: Prefilter, boundary: str | Boundary = Boundary.MIRROR) -> Tensor:
+def prefilter_samples(
+    samples: Tensor, prefilter: str | Prefilter, boundary: str | Boundary = Boundary.MIRROR
+) -> Tensor:
     """Coefficients of a whole volume `(..., D, H, W)`: `prefilter_axis` along x, y and z, same shape and dtype.
 
     Under border and zeros these are the coefficients inside the volume only; `reconstruct` keeps the tails as well.

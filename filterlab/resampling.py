@@ -37,7 +37,7 @@ def resample(
             the old box of voxels; along an axis of length n·s it has max(1, round(n·s/spacing)) voxels.
         shape: new (D, H, W). The box of voxels is kept exactly, the spacing follows.
         like: a volume whose grid is taken over, wherever it lies (rotated too); outside the old box the boundary rules.
-        dtype: type of the computation and the result; default promote(volume.dtype, float32).
+        dtype: floating type of the computation and the result; default promote(volume.dtype, float32).
 
     Exactly one of spacing, shape and like must be given. This reconstructs, it does not anti-alias: when the new grid
     is coarser than the old one, blur first. Cost: one pass of S taps per axis; memory: about two volumes of the larger
@@ -47,16 +47,21 @@ def resample(
         a Volume, differentiable in the samples.
     """
     volume = as_volume(volume)
-    target_shape, geometry = _target(volume, spacing, shape, like)
-    field = reconstruct(volume, method, boundary=boundary, prefilter=prefilter)
-    assert isinstance(field, GridField)
+    target_shape, geometry = _target(volume, spacing, shape, None if like is None else as_volume(like))
     dtype = dtype or torch.promote_types(volume.dtype, torch.float32)
+    if not dtype.is_floating_point:
+        raise ValueError(f"dtype must be a floating type (round and clip the result for {dtype}); got {dtype}")
+    working = torch.promote_types(dtype, torch.float32)
+    field = reconstruct(
+        volume if volume.dtype == working else volume.to(working), method, boundary=boundary, prefilter=prefilter
+    )
+    assert isinstance(field, GridField)
     steps = np.linalg.solve(volume.affine, geometry.affine)  # new voxel -> old voxel
     if np.allclose(steps[:3, :3], np.diag(np.diag(steps[:3, :3])), rtol=0, atol=1e-12 * np.abs(steps[:3, :3]).max()):
-        samples = _separable(field, target_shape, np.diag(steps)[:3], steps[:3, 3], dtype)
+        samples = _separable(field, target_shape, np.diag(steps)[:3], steps[:3, 3], working)
     else:
-        samples = _pointwise(field, target_shape, geometry, dtype)
-    return Volume.with_geometry(samples, geometry)
+        samples = _pointwise(field, target_shape, geometry, working)
+    return Volume.with_geometry(samples.to(dtype), geometry)
 
 
 def _target(
@@ -73,8 +78,8 @@ def _target(
         size = np.maximum(1, np.round(extent / new)).astype(np.int64)
     else:
         assert shape is not None
-        if len(shape) != 3 or any(int(n) != n or n < 1 for n in shape):
-            raise ValueError(f"shape must be three integers ≥ 1 in D, H, W order; got {tuple(shape)}")
+        if not isinstance(shape, Sequence) or len(shape) != 3 or any(int(n) != n or n < 1 for n in shape):
+            raise ValueError(f"shape must be three integers ≥ 1 in D, H, W order; got {shape!r}")
         size = np.asarray(shape[::-1], dtype=np.int64)
         new = extent / size
     direction = np.asarray(volume.geometry.matrix) / volume.spacing

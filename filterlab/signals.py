@@ -39,7 +39,8 @@ class Signal(Field):
     ) -> None:
         self.name = name
         self._function = value_and_gradient
-        size = voxel_size or max(b - a for a, b in zip(lower, upper, strict=True)) / 64
+        size = max(b - a for a, b in zip(lower, upper, strict=True)) / 64 if voxel_size is None else voxel_size
+        _require_positive(voxel_size=size)
         self.domain = Domain(lower, upper, Geometry(), size)
 
     def with_voxel_size(self, voxel_size: float) -> Signal:
@@ -88,6 +89,25 @@ class Signal(Field):
         return Volume(torch.stack(planes), spacing=spacing, origin=origin)
 
 
+def _require_positive(**parameters: float) -> None:
+    for name, value in parameters.items():
+        if not (isinstance(value, int | float) and 0 < value < math.inf):
+            raise ValueError(f"{name} must be a positive number; got {value!r}")
+
+
+def _distance(d: Tensor) -> Tensor:
+    """|d| along the last axis, with derivative 0 (and all that follow finite) at d = 0."""
+    squared = (d * d).sum(-1)
+    center = squared == 0
+    return torch.where(center, 0 * squared, torch.where(center, torch.ones_like(squared), squared).sqrt())
+
+
+def _unit(d: Tensor) -> Tensor:
+    """d / |d|, 0 at d = 0."""
+    r = _distance(d)
+    return d / torch.where(r == 0, torch.ones_like(r), r)[..., None]
+
+
 def _jacobian(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
     """d function_i / d point_j of a pointwise function, `(..., 3)` -> `(..., 3, 3)`; differentiable again."""
     gradient, pull_back = torch.func.vjp(function, points)[:2]
@@ -107,11 +127,12 @@ def marschner_lobb(frequency: float = 6.0, alpha: float = 0.25, voxel_size: floa
     Source: Marschner & Lobb, An evaluation of reconstruction filters for volume rendering, 1994 (f_M = 6, α = 0.25).
     """
 
+    _require_positive(frequency=frequency, alpha=alpha)
+
     def function(p: Tensor) -> tuple[Tensor, Tensor]:
         x, y, z = p.unbind(-1)
         scale = 1 / (2 * (1 + alpha))
-        squared = x * x + y * y
-        r = squared.clamp_min(torch.finfo(p.dtype).tiny).sqrt()
+        r = _distance(p[..., :2])
         phase = 2 * math.pi * frequency * torch.cos(math.pi / 2 * r)
         # d phase / d r divided by r is finite at r = 0: −2π f (π/2)² sinc(r/2)
         slope_over_r = -2 * math.pi * frequency * (math.pi / 2) ** 2 * torch.sinc(r / 2)
@@ -185,12 +206,13 @@ def sphere(
     `edge` is the width of the blur, in world units. The gradient points to the centre; at the centre itself it is 0.
     """
 
+    _require_positive(radius=radius, edge=edge)
+
     def function(p: Tensor) -> tuple[Tensor, Tensor]:
         d = p - p.new_tensor(center)
-        r = (d * d).sum(-1).clamp_min(torch.finfo(p.dtype).tiny).sqrt()
-        u = (r - radius) / edge
+        u = (_distance(d) - radius) / edge
         slope = -torch.exp(-u * u) / (math.sqrt(math.pi) * edge)
-        return 0.5 * torch.erfc(u), (slope / r)[..., None] * d
+        return 0.5 * torch.erfc(u), slope[..., None] * _unit(d)
 
     return Signal("sphere", function, voxel_size=voxel_size)
 
@@ -198,16 +220,19 @@ def sphere(
 def sphere_distance(radius: float = 0.6, center: Corner = (0.0, 0.0, 0.0), voxel_size: float | None = None) -> Signal:
     """The signed distance to a sphere on [−1, 1]³, negative inside: |p − c| − radius."""
 
+    _require_positive(radius=radius)
+
     def function(p: Tensor) -> tuple[Tensor, Tensor]:
         d = p - p.new_tensor(center)
-        r = (d * d).sum(-1).clamp_min(torch.finfo(p.dtype).tiny).sqrt()
-        return r - radius, d / r[..., None]
+        return _distance(d) - radius, _unit(d)
 
     return Signal("sphere-distance", function, voxel_size=voxel_size)
 
 
 def gaussian(sigma: float = 0.3, center: Corner = (0.0, 0.0, 0.0), voxel_size: float | None = None) -> Signal:
     """exp(−|p − c|² / (2σ²)) on [−1, 1]³: smooth, so that every method shows its order early."""
+
+    _require_positive(sigma=sigma)
 
     def function(p: Tensor) -> tuple[Tensor, Tensor]:
         d = p - p.new_tensor(center)

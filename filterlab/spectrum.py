@@ -68,7 +68,8 @@ def measured_response(
     samples = torch.zeros(1, 1, 2 * reach + 1, dtype=torch.float64, device=omega.device)
     samples[..., reach] = 1
     volume = samples.expand(3, 3, -1)
-    field = reconstruct(volume, method, boundary=Boundary.WRAP, prefilter=prefilter, scheme=scheme)
+    gradient = method.sampled_gradient if scheme == "eight_trilinear" else None
+    field = reconstruct(volume, method, boundary=Boundary.WRAP, prefilter=prefilter, scheme=scheme, gradient=gradient)
     x, weights = _half_voxel_quadrature(2 * reach, omega.device)
     impulse = _mean_over_a_voxel(field, x + reach)
     phases = torch.cos(omega.to(torch.float64)[..., None] * x)  # h is even: its transform is real

@@ -90,10 +90,13 @@ class Boundary(StrEnum):
             tail: how far beyond the ends coefficients are stored (border and zeros).
 
         Returns:
-            (folded, sign): folded lies in [0, n−1] (mirror), [−½, n−½] (reflect), [0, n] (wrap) or
-            [−tail, n−1+tail]; points already there are returned bit for bit. sign is +1, −1 where a reflection turned
-            the axis round, 0 where the extension is constant.
+            (folded, sign): folded lies in [0, n−1] (mirror), [−½, n−½] (reflect), [0, n] (wrap) or [−tail, n−1+tail];
+            points already there are returned bit for bit. sign = d folded / d x, everywhere: +1, −1 where a reflection
+            turned the axis round, 0 where the extension is constant.
         """
+        return _Fold.apply(x, self, n, tail)  # type: ignore[return-value]
+
+    def _fold(self, x: Tensor, n: int, tail: int) -> tuple[Tensor, Tensor]:
         one = torch.ones_like(x)
         match self:
             case Boundary.MIRROR if n == 1:
@@ -109,8 +112,36 @@ class Boundary(StrEnum):
                 return x.clamp(low, high), torch.where((x < low) | (x > high), 0 * one, one)
 
 
+class _Fold(torch.autograd.Function):
+    """Folded coordinates with d folded / d x = sign, also on the planes of reflection, where |·| and min have none."""
+
+    @staticmethod
+    def forward(x: Tensor, boundary: Boundary, n: int, tail: int) -> tuple[Tensor, Tensor]:
+        return boundary._fold(x, n, tail)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(output[1])
+        ctx.save_for_forward(output[1])
+
+    @staticmethod
+    def backward(ctx, *gradients: Tensor):
+        (sign,) = ctx.saved_tensors
+        return gradients[0] * sign, None, None, None
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        (sign,) = ctx.saved_tensors
+        return tangents[0] * sign, None
+
+    @staticmethod
+    def vmap(info, in_dims, x: Tensor, boundary: Boundary, n: int, tail: int):
+        return boundary.fold(x, n, tail), (in_dims[0], in_dims[0])
+
+
 def _reflect_at(x: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
-    """x reflected at `low` and `high` until it lies between, and ±1 = d reflected / d x."""
+    """x reflected at `low` and `high` until it lies between, and the sign ±1 of d reflected / d x."""
     period = 2 * (high - low)
     outside = (x < low) | (x > high)
     w = x.fmod(period) - low  # fmod first: it is exact, so 1e8 folds as exactly as 1
@@ -121,7 +152,10 @@ def _reflect_at(x: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
 
 
 def _triple(name: str, value: Sequence[float] | Tensor | np.ndarray | float) -> tuple[float, float, float]:
-    values = np.asarray(value, dtype=np.float64)
+    try:
+        values = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be three finite numbers in x, y, z order; got {value!r}") from None
     if values.ndim == 0:
         values = np.repeat(values, 3)
     if values.shape != (3,) or not np.isfinite(values).all():
@@ -145,8 +179,11 @@ class Geometry:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not np.isfinite(self.matrix).all() or abs(np.linalg.det(self.matrix)) < 1e-300:
-            raise ValueError(f"the affine must be finite and invertible; got the 3×3 part {self.matrix}")
+        m = np.asarray(self.matrix, dtype=np.float64)
+        scale = np.abs(m).max(axis=0)
+        regular = np.isfinite(m).all() and scale.min() > 0 and abs(np.linalg.det(m / scale)) >= 1e-9
+        if not regular or not np.isfinite(self.origin).all():
+            raise ValueError(f"the affine must be finite and invertible; got {self.affine.tolist()}")
 
     @classmethod
     def of(
@@ -324,7 +361,9 @@ def _checked_samples(samples: Tensor) -> Tensor:
 
 
 def as_volume(volume: Volume | Tensor) -> Volume:
-    """A `Volume` as it is; a bare tensor with voxel centres at the integers."""
+    """A `Volume` as it is; a bare tensor with voxel centres at the integers. Raises TypeError for anything else."""
+    if not isinstance(volume, Volume | Tensor):
+        raise TypeError(f"expected a Volume or a torch.Tensor; got {type(volume).__name__}")
     return volume if isinstance(volume, Volume) else Volume(volume)
 
 

@@ -353,3 +353,17 @@ def test_a_field_of_one_period_repeats_with_its_gradient():
             mirrored.requires_grad_()
             (slope,) = torch.autograd.grad(field(mirrored).sum(), mirrored)
             laws.assert_close(slope * torch.tensor([-1.0, 1, 1]), slopes[0], 1e-12)
+
+
+@pytest.mark.parametrize("boundary", list(Boundary))
+@pytest.mark.parametrize("method", ["trilinear", "triquadratic", "tricubic"])
+def test_derivatives_on_the_planes_of_reflection(method, boundary):
+    """Integers and half-integers far outside, where a fold made of |·| and min would have derivative 0."""
+    field = reconstruct(volume(8, 8, 8), method, boundary=boundary)
+    planes = [[14.0, 2.3, 2.3], [-8.5, 3.1, 22.2], [-7.0, 2.2, 0.3], [7.0, -3.2, 7.5], [21.0, -14.0, -0.5]]
+    points = torch.tensor(planes, dtype=torch.float64, requires_grad=True)
+    value, gradient, hessian = field.jet(points, 2)
+    (first,) = torch.autograd.grad(value.sum(), points, retain_graph=True)
+    laws.assert_close(first, gradient, 1e-12)
+    second = [torch.autograd.grad(gradient[:, i].sum(), points, retain_graph=True)[0] for i in range(3)]
+    laws.assert_close(torch.stack(second, 1), hessian, 1e-12)

@@ -206,3 +206,18 @@ def test_interpolation_keeps_a_zero_between_the_samples_of_a_kernel():
     prefilter = interpolation(Kernel("boxes", tuple((h,) for h in heights)))
     omega = torch.linspace(0, 7, 50, dtype=torch.float64)
     laws.assert_close(prefilter.response(omega), 1 / (1.25 - 0.25 * torch.cos(2 * omega)), 1e-14)
+
+
+def test_only_symmetric_kernels_that_sum_to_one_get_a_prefilter():
+    twice = Kernel("twice", tuple(tuple(2 * c for c in p) for p in bspline(3).pieces))
+    lopsided = Kernel("lopsided", tuple((Fraction(c, 8),) for c in (1, 5, 2)))
+    for kernel in (twice, lopsided):
+        with pytest.raises(ValueError, match="symmetric kernels whose integer samples sum to 1"):
+            interpolation(kernel)
+
+
+def test_prefilters_go_by_name():
+    x = torch.rand(4, 4, 4)
+    assert torch.equal(prefilter_samples(x, "cubic"), prefilter_samples(x, PREFILTERS["cubic"]))
+    with pytest.raises(ValueError, match="known prefilters: identity, quadratic"):
+        prefilter_samples(x, "cubik")

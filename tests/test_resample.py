@@ -173,3 +173,23 @@ def test_float32_positions_do_not_drift_on_long_axes():
 def test_callers_mistakes(target, match):
     with pytest.raises(ValueError, match=match):
         resample(torch.zeros(3, 3, 3), **target)
+
+
+def test_dtypes():
+    volume = Volume((255 * torch.rand(6, 6, 6)).to(torch.uint8))
+    with pytest.raises(ValueError, match="floating type"):
+        resample(volume, spacing=0.5, dtype=torch.uint8)
+    exact = resample(volume.to(torch.float64), "tricubic", spacing=0.5)
+    laws.assert_close(resample(volume, "tricubic", spacing=0.5, dtype=torch.float64).samples, exact.samples, 1e-14)
+    half = resample(volume, "tricubic", spacing=0.5, dtype=torch.float16)
+    assert half.dtype == torch.float16
+    assert (half.samples - exact.samples).abs().max() < 0.13  # overshoot above 256 has float16 units of 0.25
+
+
+def test_mistaken_targets():
+    x = torch.rand(3, 4, 5)
+    assert resample(torch.rand(6, 6, 6), like=x).shape == (3, 4, 5)
+    with pytest.raises(ValueError, match="three integers"):
+        resample(x, shape=5)
+    with pytest.raises(TypeError, match=r"expected a Volume or a torch\.Tensor; got str"):
+        resample(x, like="x")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from filterlab.fields.base import Field
 from filterlab.fields.tensor_product import SAMPLERS, exact_sample
 from filterlab.methods import METHODS, reconstruct
 from filterlab.volume import Boundary
@@ -15,6 +16,11 @@ SAMPLED = [name for name, method in METHODS.items() if "eight_trilinear" in meth
 SHAPE = (5, 7, 6)
 every_sampled = pytest.mark.parametrize("method", SAMPLED)
 every_boundary = pytest.mark.parametrize("boundary", Boundary)
+
+
+def sampled(samples: torch.Tensor, method: str, **options) -> Field:
+    """The method by trilinear samples, with the kind of gradient they give it."""
+    return reconstruct(samples, method, scheme="eight_trilinear", gradient=METHODS[method].sampled_gradient, **options)
 
 
 def volume() -> torch.Tensor:
@@ -61,7 +67,7 @@ def test_the_number_of_samples_is_the_paper_s(method, value, value_and_gradient)
         counted.append(at.shape[1])
         return exact_sample(coefficients, at)
 
-    field = reconstruct(volume(), method, scheme="eight_trilinear", sampler=counting)
+    field = sampled(volume(), method, sampler=counting)
     for order, expected in ((0, value), (1, value_and_gradient)):
         counted.clear()
         field.jet(points(), order)
@@ -73,9 +79,7 @@ def test_the_number_of_samples_is_the_paper_s(method, value, value_and_gradient)
 @pytest.mark.parametrize("prefilter", [True, False])
 def test_a_texture_unit_rounds_fractions_to_1_256(method, boundary, prefilter):
     """Sample by sample as the oracle does it."""
-    field = reconstruct(
-        volume(), method, boundary=boundary, prefilter=prefilter, scheme="eight_trilinear", sampler="texture_unit"
-    )
+    field = sampled(volume(), method, boundary=boundary, prefilter=prefilter, sampler="texture_unit")
     at = points(beyond=0.8)
     expected = oracles.trilinear_scheme(method, volume().numpy(), at.numpy(), str(boundary), prefilter, steps=256)
     for actual, exact in zip(field.value_and_gradient(at), expected, strict=True):
@@ -85,8 +89,8 @@ def test_a_texture_unit_rounds_fractions_to_1_256(method, boundary, prefilter):
 @every_sampled
 def test_what_a_texture_unit_costs_is_bounded_and_not_nothing(method):
     """A rounded fraction moves a sample by at most 1/512 of a step along each axis; a slope by four times that."""
-    exact = reconstruct(volume(), method, scheme="eight_trilinear")
-    rounded = reconstruct(volume(), method, scheme="eight_trilinear", sampler="texture_unit")
+    exact = sampled(volume(), method)
+    rounded = sampled(volume(), method, sampler="texture_unit")
     deconvolve = oracles.RECIPES[method].deconvolve if method in oracles.RECIPES else ()
     c = oracles.coefficients(volume().numpy(), deconvolve, "mirror", np.arange(-8, 16))
     sample_error = 3 / 512 * np.ptp(c)
@@ -137,3 +141,27 @@ def test_a_field_tells_how_it_is_evaluated(method):
     assert sampled.scheme.gradient == METHODS[method].sampled_gradient
     assert sampled.max_order == 1
     assert reconstruct(volume(), method).scheme.name == "direct"
+
+
+@pytest.mark.parametrize("method", ["trilinear", "ncrsi", "triquadratic", "notch", "tricubic"])
+def test_float32_keeps_its_digits_on_a_long_axis(method):
+    """Positions x ± δ rounded to float32 would cost up to 8e-5 of the range here."""
+    samples, points = torch.rand(3, 3, 512), torch.rand(2000, 3) * torch.tensor([511.0, 2.0, 2.0])
+    gradient = "central" if method == "trilinear" else None
+    expected = reconstruct(samples.double(), method, gradient=gradient).jet(points.double(), 1)
+    for scheme in ("direct", "eight_trilinear"):
+        for got, want in zip(
+            reconstruct(samples, method, gradient=gradient, scheme=scheme).jet(points, 1), expected, strict=True
+        ):
+            assert (got - want).abs().max() < 2e-6
+
+
+def test_a_scheme_does_not_change_the_kind_of_gradient_silently():
+    with pytest.raises(ValueError, match="ask for gradient='central'"):
+        reconstruct(volume(), "trilinear", scheme="eight_trilinear")
+
+
+def test_a_field_says_what_it_is():
+    field = reconstruct(volume(), "notch", scheme="eight_trilinear", boundary="wrap")
+    for word in ("notch", "eight_trilinear", "analytic", "wrap", "float64"):
+        assert word in repr(field)

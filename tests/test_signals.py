@@ -134,3 +134,19 @@ def test_callers_mistakes():
         signal.sample(1, centering="node")
     with pytest.raises(ValueError, match="centering"):
         signal.sample(4, centering="corner")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", list(signals.SIGNALS))
+def test_finite_at_the_singular_points(name):
+    for jet in signals.named(name).jet(torch.zeros(1, 3, dtype=torch.float64), 2):
+        assert jet.isfinite().all()
+        assert jet.abs().max() < 1e4
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter"), [("sphere", "edge"), ("gaussian", "sigma"), ("marschner-lobb", "voxel_size")]
+)
+def test_parameters_that_must_be_positive(name, parameter):
+    for value in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match=f"{parameter} must be a positive number"):
+            signals.named(name, **{parameter: value})

@@ -189,3 +189,22 @@ def test_the_domain_of_a_grid_is_its_whole_cells():
     assert domain.voxel_size == 1
     assert domain.center == pytest.approx((11.5, 22, 32))
     assert domain.diagonal == pytest.approx((16 + 36 + 64) ** 0.5)
+
+
+@pytest.mark.parametrize(
+    "matrix", [[[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]], [[1, 0, 0], [0, 0, 0], [0, 0, 1]]]
+)
+def test_a_singular_affine_is_refused(matrix):
+    affine = np.eye(4)
+    affine[:3, :3] = matrix
+    with pytest.raises(ValueError, match="finite and invertible"):
+        Volume(torch.zeros(2, 2, 2), affine=affine)
+
+
+def test_a_tiny_spacing_is_no_singular_affine():
+    assert Volume(torch.zeros(2, 2, 2), spacing=1e-101).spacing == pytest.approx((1e-101,) * 3)
+
+
+def test_unsigned_types_without_indexing_are_refused():
+    with pytest.raises(TypeError, match=r"convert: samples\.to\(torch\.int32\)"):
+        Volume(torch.zeros(2, 2, 2, dtype=torch.uint16))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -135,6 +136,28 @@ class GridField(Field):
         self.domain = Domain.of_grid(volume.size, volume.geometry)
         self.max_order = scheme.max_order
         self.channels = (volume.shape[0], volume.shape[1]) if volume.batched else None
+
+    def __repr__(self) -> str:
+        scheme, values = self.scheme, self.coefficients.values
+        size = "×".join(str(n) for n in self.coefficients.size)
+        return (
+            f"{type(self).__name__}({self.method}, scheme={scheme.name}, gradient={scheme.gradient}, "
+            f"boundary={self.coefficients.boundary}, {size} voxels, {str(values.dtype).removeprefix('torch.')})"
+        )
+
+    def select(self, n: int, c: int) -> GridField:
+        """The unbatched field of entry n and channel c of a batched one: a view of its coefficients, differentiable.
+
+        Raises:
+            ValueError: this field is not batched.
+            IndexError: no such entry or channel.
+        """
+        if self.channels is None:
+            raise ValueError("select needs a batched field, of a volume (N, C, D, H, W); this one is unbatched")
+        one = copy(self)
+        one.coefficients = replace(self.coefficients, values=self.coefficients.values[n, c])
+        one.channels = None
+        return one
 
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         check_order(order, self.max_order)

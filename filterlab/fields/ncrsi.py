@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.grid import Coefficients, Term
-from filterlab.fields.tensor_product import Sampler, along, unit_steps
+from filterlab.fields.tensor_product import Sampler, along, unit_steps, with_exact_positions
 from filterlab.kernels import CATMULL_ROM, LINEAR
 
 NCRSI_TERMS: tuple[Term, ...] = (
@@ -41,6 +41,7 @@ class SevenSamples:
     max_order: int = 1
     reach: int = 3
 
+    @with_exact_positions
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
         center = self.sample(coefficients, points)
         ahead, behind = unit_steps(self.sample, coefficients, points)

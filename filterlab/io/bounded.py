@@ -142,10 +142,13 @@ def check_geometry(path: Path, affine: np.ndarray) -> Geometry:
         raise VolumeFileError(path, "an affine of finite numbers", a.tolist())
     if a[3].tolist() != [0, 0, 0, 1]:
         raise VolumeFileError(path, "an affine with the last row 0 0 0 1", a[3].tolist())
-    scale = np.abs(a[:3, :3]).max(axis=0)
-    if scale.min() < 1e-60 or abs(np.linalg.det(a[:3, :3] / scale)) < 1e-9:
-        raise VolumeFileError(path, "voxel steps along x, y, z that span space (an invertible affine)", a.tolist())
-    return Geometry.of(affine=a + 0.0)  # + 0.0: no negative zeros
+    try:
+        if np.abs(a[:3, :3]).max(axis=0).min() < 1e-60:
+            raise ValueError
+        return Geometry.of(affine=a + 0.0)  # + 0.0: no negative zeros
+    except ValueError:
+        what = "voxel steps along x, y, z that span space (an invertible affine)"
+        raise VolumeFileError(path, what, a.tolist()) from None
 
 
 def scaled(spacing: Sequence[float], origin: Sequence[float]) -> np.ndarray:
