@@ -104,7 +104,7 @@ class Resample:
     dtype: str = "float32"
     """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN."""
     max_gigabytes: float = 8.0
-    """The most memory that one volume may take."""
+    """The most memory that one volume may take: IN as it is read, or the result as it is computed or written."""
 
     def run(self, overrides: dict[str, str]) -> None:
         from filterlab.io.atomic import check_writable
@@ -131,16 +131,23 @@ class Resample:
         source = describe(self.input)
         target = None if self.like is None else describe(self.like)
         dtype = _result_type(self.dtype, source)
+        working = torch.float64 if torch.float64 in (dtype, source.dtype) else torch.float32
         check_saveable(self.output, batched=len(source.shape) == 5)
-        limit = int(self.max_gigabytes * 2**30)
-        _check_memory(self._new_size(source, target), source, limit)
+        limit = self._limit()
+        shape = [*source.shape[:-3], *self._new_size(source, target)]
+        _check_memory(shape, max(working.itemsize, dtype.itemsize), limit)
         volume = load_volume(self.input, max_bytes=limit)
-        working = torch.float64 if torch.float64 in (dtype, volume.dtype) else torch.float32
         grid: dict = {"spacing": self.spacing} if self.spacing else {"shape": self.shape[::-1] if self.shape else None}
         if target is not None:  # a grid without samples: one voxel, shown over and over
             grid = {"like": Volume.with_geometry(torch.zeros(()).expand(target.shape[-3:]), target.geometry)}
         result = resample(volume, self.method, boundary=self.boundary, dtype=working, **grid)
         save_volume(_converted(result, dtype), self.output)
+
+    def _limit(self) -> int:
+        """Bytes that one volume may take."""
+        if not 0 < self.max_gigabytes < math.inf:  # a NaN fails too
+            raise ValueError(f"expected --max-gigabytes to be a positive number; got {self.max_gigabytes}")
+        return int(self.max_gigabytes * 2**30)
 
     def _new_size(self, source: VolumeHeader, target: VolumeHeader | None) -> list[float]:
         """Voxels along x, y, z of the result; checks what was asked."""
@@ -160,9 +167,11 @@ class Resample:
 class Methods:
     """List the reconstruction methods and what each promises.
 
-    support: voxels that one value depends on along an axis. order: L, the error falls as the L-th power of the voxel
-    size (and without the prefilter). smooth: C0 continuous, C1 its gradient too, C2 its curvature too. samples: whether
-    the reconstruction returns the samples at the voxel centres (and without the prefilter).
+    support: width of the kernel along an axis, in voxels; with a prefilter the influence of a sample goes on beyond it
+    and decays. taps: coefficients that one value is the sum of; the notch, whose kernel has 64 taps, is evaluated with
+    27 after averaging neighbours. order: L, the error falls as the L-th power of the voxel size (and without the
+    prefilter). smooth: C0 continuous, C1 its gradient too, C2 its curvature too. samples: whether the reconstruction
+    returns the samples at the voxel centres (and without the prefilter).
     """
 
     def run(self, overrides: dict[str, str]) -> None:
@@ -251,6 +260,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MemoryError as error:
         print(f"filterlab: expected more memory than there is; {error}", file=sys.stderr)
         return FAILED
+    except RuntimeError as error:  # torch has no type of its own for an allocation that fails on the CPU
+        if not _out_of_memory(error):
+            raise
+        print(f"filterlab: expected more memory than there is; {_shortage(error)}", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
         print("filterlab: interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -303,6 +317,21 @@ def _message(error: ValueError | OSError) -> str:
     return str(error)
 
 
+def _out_of_memory(error: RuntimeError) -> bool:
+    """Whether it is torch that could not allocate, on the CPU or on a device."""
+    signs = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
+    return any(sign in str(error) for sign in signs)
+
+
+def _shortage(error: RuntimeError) -> str:
+    asked = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", str(error))
+    return f"torch could not get another {asked[1]}" if asked else _first_line(error)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
 def _check_not_input(output: Path, source: Path) -> None:
     if os.path.realpath(output) == os.path.realpath(source):
         raise ValueError(f"expected an output other than the input; got {output} for both")
@@ -319,12 +348,11 @@ def _check_name(what: str, name: str, known: object) -> None:
 def _check_device(name: str) -> None:
     import torch
 
-    try:
-        torch.empty(1, device=name)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
+    try:  # rays are float64, and a value must come back (`meta` has none)
+        torch.ones(1, dtype=torch.float64, device=name).item()
+    except (RuntimeError, AssertionError, TypeError) as error:
         raise ValueError(
-            f"device: expected a device that torch can use here, like cpu; got {name!r} ({reason})"
+            f"device: expected a device that torch can use here, like cpu; got {name!r} ({_first_line(error)})"
         ) from None
 
 
@@ -336,14 +364,22 @@ def _result_type(name: str, source: VolumeHeader) -> torch.dtype:
     return source.dtype if name == "input" else types[name]
 
 
-def _check_memory(size: Sequence[float], source: VolumeHeader, limit: int) -> None:
-    needed = math.prod(size) * math.prod(source.shape[:-3]) * 4
+def _check_memory(shape: Sequence[float], itemsize: int, limit: int) -> None:
+    """Raises ValueError for a result (N, C and voxels along x, y, z) above the limit or what the machine has."""
+    needed = math.prod(shape) * itemsize
+    got = f"{' × '.join(f'{n:.6g}' for n in shape)} voxels of {itemsize} bytes, {needed / 2**30:.3g} GiB"
     if needed > limit:
-        shape = " × ".join(f"{n:.6g}" for n in size)
-        raise ValueError(
-            f"expected a result of at most {limit / 2**30:g} GiB (--max-gigabytes); got {shape} voxels, "
-            f"{needed / 2**30:.3g} GiB"
-        )
+        raise ValueError(f"expected a result of at most {limit / 2**30:g} GiB (--max-gigabytes); got {got}")
+    if needed > (installed := _installed_memory()):
+        raise ValueError(f"expected a result that fits in the {installed / 2**30:.3g} GiB of this machine; got {got}")
+
+
+def _installed_memory() -> float:
+    """Bytes of main memory; ∞ where the system does not tell."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):
+        return math.inf
 
 
 def _converted(volume: Volume, dtype: torch.dtype) -> Volume:

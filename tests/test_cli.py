@@ -159,6 +159,16 @@ def test_methods_shows_every_fact(capsys: pytest.CaptureFixture[str]) -> None:
         assert cells[8] == method.summary
 
 
+def test_methods_help_is_true_of_prefiltered_methods(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["methods", "--help"]) == 0
+    words = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "support: width of the kernel along an axis" in words
+    assert "with a prefilter the influence of a sample goes on beyond it and decays" in words
+    assert "whose kernel has 64 taps, is evaluated with 27 after averaging neighbours" in words
+    assert METHODS["notch"].facts.support ** 3 == 64
+    assert METHODS["notch"].facts.taps == 27
+
+
 def facts(text: str) -> dict[str, str]:
     """Lines of two columns as a dict."""
     rows = [line.strip().split("  ", 1) for line in text.splitlines() if "  " in line.strip()]
@@ -217,6 +227,20 @@ def test_info_of_a_damaged_file(capsys: pytest.CaptureFixture[str], volume_file:
     capsys.readouterr()
     assert main(["info", str(volume_file)]) == 1
     assert "in.nrrd: expected gzip data" in capsys.readouterr().err
+
+
+def test_a_bare_tensor_is_saved_with_centres_at_the_integers(tmp_path: Path) -> None:
+    samples = torch.rand(2, 3, 4)
+    save_volume(samples, tmp_path / "a.nrrd")
+    found = load_volume(tmp_path / "a.nrrd")
+    assert torch.equal(found.samples, samples)
+    assert np.array_equal(found.affine, np.eye(4))
+    save_volume(torch.rand(1, 2, 3, 4, 5), tmp_path / "b.npy")
+    assert load_volume(tmp_path / "b.npy").shape == (1, 2, 3, 4, 5)
+    for wrong in (samples[0], samples.numpy()):
+        with pytest.raises((ValueError, TypeError), match=r"shape|Tensor"):
+            save_volume(wrong, tmp_path / "c.npy")  # type: ignore[arg-type]
+    assert not (tmp_path / "c.npy").exists()
 
 
 # --- resample ---------------------------------------------------------------------------------------------------------
@@ -296,7 +320,52 @@ def test_resample_refuses_before_it_works(
     refused("1 or more", more=["--shape", 1, 0, 1])
     refused("--max-gigabytes", "GiB", more=["--spacing", 1e-5, 1e-5, 1e-5])
     refused("--max-gigabytes", more=["--shape", 300, 300, 300, "--max-gigabytes", 0.1])
+    for limit in ("nan", "inf", "0", "-1"):
+        refused(f"--max-gigabytes to be a positive number; got {float(limit)}", more=[*shape, "--max-gigabytes", limit])
+    much = [*shape[:1], 10**6, 10**6, 10**4, "--max-gigabytes", "1e9"]
+    refused("GiB of this machine; got 1e+06 × 1e+06 × 10000 voxels of 4 bytes", more=much)
     assert sorted(os.listdir(tmp_path)) == before
+
+
+@pytest.mark.parametrize(
+    ("dtype", "stored", "itemsize"),
+    [
+        ("float32", torch.uint8, 4),
+        ("float64", torch.uint8, 8),
+        ("int64", torch.uint8, 8),  # computed in 4 bytes, written in 8
+        ("uint8", torch.uint8, 4),  # computed in 4 bytes, written in 1
+        ("float32", torch.float64, 8),  # computed in 8 bytes, written in 4
+        ("input", torch.float64, 8),
+    ],
+)
+def test_the_memory_limit_counts_the_bytes_of_the_type(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, dtype: str, stored: torch.dtype, itemsize: int
+) -> None:
+    save_volume(torch.ones(2, 2, 2, dtype=stored), tmp_path / "in.nrrd")
+    line = ["resample", tmp_path / "in.nrrd", "-o", tmp_path / "out.nrrd", "--shape", 16, 16, 16, "--dtype", dtype]
+    exact = 16**3 * itemsize / 2**30
+    assert main([str(a) for a in [*line, "--max-gigabytes", exact]]) == 0
+    assert capsys.readouterr().err == ""
+    fails(capsys, [*line, "--max-gigabytes", exact * 0.999], 1, "--max-gigabytes", f"voxels of {itemsize} bytes")
+
+
+def test_an_allocation_that_fails_has_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], volume_file: Path
+) -> None:
+    out = volume_file.with_name("out.nrrd")
+    line = ["resample", volume_file, "-o", out, "--spacing", "1e-14", 1, 1, "--max-gigabytes", "1e9"]
+    monkeypatch.setattr("filterlab.cli._installed_memory", lambda: float("inf"))  # torch has to find out itself
+    fails(capsys, line, 1, "expected more memory than there is; torch could not get another", "bytes")
+    line[5:8] = ["1e-17", 100, 100]
+    fails(capsys, [*line[:-1], "1e12"], 1, "expected more memory than there is")
+    assert not out.exists()
+
+    def defect(*_: object, **__: object) -> None:
+        raise RuntimeError("shapes do not match")
+
+    monkeypatch.setattr("filterlab.resampling.resample", defect)
+    with pytest.raises(RuntimeError, match="shapes do not match"):
+        main(["resample", str(volume_file), "-o", str(out), "--shape", *"222"])
 
 
 # --- render -----------------------------------------------------------------------------------------------------------
@@ -334,6 +403,9 @@ def test_render_refuses_before_it_works(
     fails(capsys, ["render", scene_file, "-o", out, "--camera.fov", "3"], 1, "--camera.fov: camera.fov: unknown key")
     fails(capsys, ["render", scene_file, "-o", out, "--size", "8"], 1, "--size: size")
     fails(capsys, ["render", scene_file, "-o", out, "--device", "moon"], 1, "device", "'moon'")
+    fails(capsys, ["render", scene_file, "-o", out, "--device", "meta"], 1, "device", "'meta'")
+    wave = "{name: plane-wave, samples: 8, parameters: {wave_vector: 3}}"
+    fails(capsys, ["render", scene_file, "-o", out, "--signal", wave], 1, "signal.parameters: wave_vector: expected")
     fails(capsys, ["render", scene_file, "-o", tmp_path / "a.jpg"], 1, "ends in .png")
     fails(capsys, ["render", scene_file, "-o", tmp_path / "no" / "a.png"], 1, "existing folder")
     fails(capsys, ["render", tmp_path / "no.yaml", "-o", out], 1, "no.yaml")

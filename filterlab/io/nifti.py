@@ -2,7 +2,7 @@
 
 World coordinates are the file's: right, anterior, superior (RAS), from the sform if it is set, else the qform, else the
 voxel sizes. scl_slope and scl_inter are applied; the result is then float32 (float64 where 32 or 64 bits are stored).
-The voxels are read by our own bounded reader, never by nibabel.
+The voxels are read by our own bounded reader, never by nibabel. Of a time series (4-D), one frame is read.
 
 Source: https://nifti.nimh.nih.gov/nifti-1 and the headers nifti1.h, nifti2.h.
 """
@@ -15,12 +15,13 @@ import math
 import warnings
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
 
 from filterlab.io.bounded import (
+    BLOCK,
     Stored,
     VolumeFileError,
     VolumeHeader,
@@ -28,8 +29,11 @@ from filterlab.io.bounded import (
     check_geometry,
     check_size,
     damaged,
+    decompressed,
+    native,
     rescaled,
     sample_dtype,
+    skip_bytes,
     storable,
 )
 from filterlab.volume import Volume
@@ -49,8 +53,11 @@ def require_nibabel(path: Path) -> Any:
     return nibabel
 
 
-def read_header(path: Path) -> VolumeHeader:
-    """The checked header of a NIfTI file. Raises VolumeFileError."""
+def read_header(path: Path, frame: int | None = None) -> VolumeHeader:
+    """The checked header of a NIfTI file; of a time series, that of one frame, counted from 0.
+
+    Raises VolumeFileError: also for a time series without a frame, a frame that it has not, or one of a 3-D file.
+    """
     nibabel = require_nibabel(path)
     compressed = path.name.lower().endswith(".gz")
     block = _first_bytes(path, compressed)
@@ -63,7 +70,7 @@ def read_header(path: Path) -> VolumeHeader:
         warnings.simplefilter("ignore")
         try:
             header = cls(block[:kind], endianness="<" if kind == little else ">", check=False)
-            return _checked(path, header, kind, compressed)
+            return _checked(path, header, kind, compressed, frame)
         except VolumeFileError:
             raise
         except Exception as error:  # whatever nibabel makes of damaged fields
@@ -77,11 +84,12 @@ def _first_bytes(path: Path, compressed: bool) -> bytes:
             return stream.read(max(HEADER_BYTES.values()))
 
 
-def _checked(path: Path, header: Any, kind: int, compressed: bool) -> VolumeHeader:
+def _checked(path: Path, header: Any, kind: int, compressed: bool, frame: int | None) -> VolumeHeader:
     magic = bytes(header["magic"].tobytes())
     if not magic.startswith((b"n+1", b"n+2")):
         raise VolumeFileError(path, "a single NIfTI file (magic n+1 or n+2)", repr(magic))
-    size = _size(path, [int(n) for n in header["dim"]])
+    size, frames = _size(path, [int(n) for n in header["dim"]])
+    index = _frame(path, frames, frame)
     try:
         dtype = header.get_data_dtype()
     except Exception:
@@ -95,7 +103,7 @@ def _checked(path: Path, header: Any, kind: int, compressed: bool) -> VolumeHead
     start = int(offset)
     stored = Stored(
         *(path, path, "gzip" if compressed else "raw"), 0 if compressed else start, start if compressed else 0,
-        *(size[::-1], dtype),
+        *((frames or 1, *size[::-1]), dtype),
     )  # fmt: skip
     stored.check()
     slope, intercept = _scaling(path, header)
@@ -110,20 +118,68 @@ def _checked(path: Path, header: Any, kind: int, compressed: bool) -> VolumeHead
         check_geometry(path, header.get_best_affine()),
         stored.encoding,
         "RAS",
-        _fields(header, slope, intercept),
+        _fields(header, slope, intercept) | ({"frame": f"{index} of {frames}"} if frame is not None else {}),
         target,
-        lambda: as_tensor(stored.read(), target) if plain else rescaled(stored.read(), slope, intercept, target),
+        lambda: (
+            as_tensor(_read_frame(stored, index), target)
+            if plain
+            else rescaled(_read_frame(stored, index), slope, intercept, target)
+        ),
     )
 
 
-def _size(path: Path, dim: list[int]) -> tuple[int, ...]:
+def _size(path: Path, dim: list[int]) -> tuple[tuple[int, ...], int | None]:
+    """Voxels along x, y, z, and how many frames there are: None for a file without a time axis."""
     rank = dim[0]
     if not 1 <= rank <= 7:
         raise VolumeFileError(path, "dim[0], the number of axes, from 1 to 7", rank)
     size = check_size(path, dim[1 : rank + 1])
-    if rank < 3 or any(n != 1 for n in size[3:]):
-        raise VolumeFileError(path, "three axes of one value per voxel (no images, channels or time)", f"sizes {size}")
-    return size[:3]
+    if rank < 3 or any(n != 1 for n in size[4:]):
+        expected = "three axes of one value per voxel, or four of a time series (no images, no channels)"
+        raise VolumeFileError(path, expected, f"sizes {size}")
+    return size[:3], size[3] if rank > 3 else None
+
+
+def _frame(path: Path, frames: int | None, frame: int | None) -> int:
+    """Which frame to read of so many (None: no time axis). Raises VolumeFileError."""
+    if frame is None:
+        if frames is not None and frames > 1:
+            expected = f"a choice among its {frames} frames, frame=0 to frame={frames - 1}: this is a time series"
+            raise VolumeFileError(path, expected, "none")
+        return 0
+    if frames is None:
+        raise VolumeFileError(path, "no frame, because it has three axes and no time", f"frame {frame!r}")
+    if not isinstance(frame, int) or isinstance(frame, bool) or not 0 <= frame < frames:
+        raise VolumeFileError(path, f"a frame from 0 to {frames - 1}", f"frame {frame!r}")
+    return frame
+
+
+def _read_frame(series: Stored, frame: int) -> np.ndarray:
+    """One volume (D, H, W) of `series`, (T, D, H, W). All is passed over, so that damage anywhere is found."""
+    if series.shape[0] == 1:
+        return series.read()[0]
+    series.check()
+    count = series.nbytes // series.shape[0]
+    with series.file.open("rb") as file:
+        file.seek(series.offset)
+        with damaged(series.header, f"{series.encoding} data of {series.nbytes} bytes"):
+            stream = decompressed(file, series.encoding)
+            skip_bytes(series.header, stream, series.skip + frame * count)
+            buffer = _exactly(series.header, stream, count)
+            skip_bytes(series.header, stream, (series.shape[0] - 1 - frame) * count)
+            if stream.read(1):
+                raise VolumeFileError(series.header, f"{series.nbytes} bytes of samples", "more than that")
+    return native(buffer, series.dtype, series.shape[1:])
+
+
+def _exactly(path: Path, stream: BinaryIO, count: int) -> bytearray:
+    """The next `count` bytes; memory grows with what is really there."""
+    buffer = bytearray()
+    while len(buffer) < count and (block := stream.read(min(BLOCK, count - len(buffer)))):
+        buffer += block
+    if len(buffer) < count:
+        raise VolumeFileError(path, f"{count} bytes of samples", f"the end of the data after {len(buffer)}")
+    return buffer
 
 
 def _scaling(path: Path, header: Any) -> tuple[float, float]:

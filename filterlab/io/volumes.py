@@ -2,8 +2,8 @@
 
 Samples become torch tensors (D, H, W), x along W, in native byte order, contiguous and writable. Types: int8, int16,
 int32, int64, uint8, float16, float32, float64 as stored; bool -> uint8, uint16 -> int32, uint32 -> int64. uint64 and
-complex numbers are refused, and so are images, several channels and time series (`.npy` and `.npz` may hold
-(N, C, D, H, W); axes of one entry are dropped from NRRD and NIfTI).
+complex numbers are refused, and so are images and several channels (`.npy` and `.npz` may hold (N, C, D, H, W); axes
+of one entry are dropped from NRRD and NIfTI). Of a time series in NIfTI, `frame` chooses one volume.
 
 Geometry is the 4×4 affine from voxel (x, y, z) to world. NIfTI is in RAS (x right, y anterior, z superior, mm); NRRD
 files that declare an anatomical space are converted to RAS; everything else is taken as it is. A round trip through any
@@ -17,31 +17,37 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from filterlab.io import nifti, nrrd, numpy_files, raw, tiff
 from filterlab.io.atomic import atomic_write
-from filterlab.io.bounded import VolumeFileError, VolumeHeader, regular_file
-from filterlab.io.config import unknown_name
-from filterlab.volume import Volume
+from filterlab.io.bounded import VolumeFileError, VolumeHeader, beside, regular_file
+from filterlab.io.config import load_config, unknown_name
+from filterlab.volume import Volume, as_volume
 
 Writer = Callable[[Volume, Path], None]
 
 
 @dataclass(frozen=True)
 class VolumeFormat:
-    """A volume format: endings of its files, how its header is read, how a volume is written (None: read only)."""
+    """A volume format: endings of its files, how its header is read, how a volume is written (None: read only).
+
+    With `frames`, it may hold a time series: then `read_header` takes a frame.
+    """
 
     name: str
     endings: tuple[str, ...]
-    read_header: Callable[[Path], VolumeHeader]
+    read_header: Callable[..., VolumeHeader]
     write: Writer | None = None
     written: tuple[str, ...] = ()
+    frames: bool = False
 
 
 FORMATS: dict[str, VolumeFormat] = {
     known.name: known
     for known in (
         VolumeFormat("NRRD", (".nrrd", ".nhdr"), nrrd.read_header, nrrd.write, (".nrrd",)),
-        VolumeFormat("NIfTI", (".nii", ".nii.gz"), nifti.read_header, nifti.write, (".nii", ".nii.gz")),
+        VolumeFormat("NIfTI", (".nii", ".nii.gz"), nifti.read_header, nifti.write, (".nii", ".nii.gz"), frames=True),
         VolumeFormat("TIFF", tiff.SUFFIXES, tiff.read_header),
         VolumeFormat("npy", (".npy",), numpy_files.read_npy_header, numpy_files.write_npy, (".npy",)),
         VolumeFormat("npz", (".npz",), numpy_files.read_npz_header, numpy_files.write_npz, (".npz",)),
@@ -84,25 +90,54 @@ def check_saveable(path: str | os.PathLike[str], *, batched: bool = False) -> Pa
     return path
 
 
-def describe(path: str | os.PathLike[str]) -> VolumeHeader:
+def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Every file that the volume at `path` is read from, resolved: sidecars, detached data, the slices of a folder.
+
+    Raises as `describe`, for what it reads of them.
+    """
+    path = Path(path)
+    name, found = format_of(path).name, [path]
+    if path.is_dir():
+        found = tiff.slices(path)
+    elif name == "npy" and numpy_files.sidecar_of(path).exists():
+        found.append(numpy_files.sidecar_of(path))
+    elif name == "NRRD" and (data := describe(path).fields.get("data file")):
+        found.append(beside(path, data))
+    elif name == "raw":
+        describe(path)
+        sidecar = path if path.name.lower().endswith(".yaml") else path.with_name(path.name + ".yaml")
+        data = load_config(sidecar, raw.RawSidecar).file or sidecar.name[: -len(".yaml")]
+        found = [sidecar, beside(sidecar, data)]
+    return tuple(file.resolve() for file in found)
+
+
+def describe(path: str | os.PathLike[str], *, frame: int | None = None) -> VolumeHeader:
     """The checked header of a volume file, without its voxels.
+
+    Args:
+        path, frame: as for `load_volume`.
 
     Raises:
         FileNotFoundError: there is no such file.
-        VolumeFileError: no known format, or a header that cannot be true of this file.
+        VolumeFileError: no known format, a header that cannot be true of this file, or no such frame.
     """
     path = Path(path)
     known = format_of(path)
     if not path.is_dir():
         regular_file(path)
-    return known.read_header(path)
+    if frame is None:
+        return known.read_header(path)
+    if not known.frames:
+        raise VolumeFileError(path, f"no frame, because {known.name} files hold one volume", f"frame {frame!r}")
+    return known.read_header(path, frame)
 
 
-def load_volume(path: str | os.PathLike[str], *, max_bytes: int = 2**33) -> Volume:
+def load_volume(path: str | os.PathLike[str], *, frame: int | None = None, max_bytes: int = 2**33) -> Volume:
     """The volume in a file (or in a folder of TIFF slices).
 
     Args:
         path: NRRD, NIfTI, TIFF, .npy, .npz, or .raw with a sidecar (`FORMATS`).
+        frame: which volume of a NIfTI time series, from 0; needed there, and refused for every other file.
         max_bytes: the most that the samples may take in memory; default 8 GiB.
 
     Raises:
@@ -110,20 +145,24 @@ def load_volume(path: str | os.PathLike[str], *, max_bytes: int = 2**33) -> Volu
         VolumeFileError: an unknown format, a damaged file, or a header that promises what the file cannot hold; raised
             before anything of the claimed size is allocated.
     """
-    header = describe(path)
+    header = describe(path, frame=frame)
     return Volume.with_geometry(header.read(max_bytes), header.geometry)
 
 
-def save_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
+def save_volume(volume: Volume | Tensor, path: str | os.PathLike[str]) -> None:
     """Writes a volume: `.nrrd` (gzip), `.nii`, `.nii.gz`, `.npy` (geometry in NAME.npy.yaml), `.npz`.
+
+    A bare tensor (D, H, W) or (N, C, D, H, W) is a volume whose voxel centres are the integers.
 
     The file appears whole or not at all. A round trip keeps samples and affine bit for bit; float16 (in NRRD, NIfTI)
     and bfloat16 come back as float32. Gradients are not saved.
 
     Raises:
         VolumeFileError: an ending that is not written, or a type or batch (N, C, …) that the format cannot hold.
+        ValueError, TypeError: a bare tensor that is no volume.
         OSError: the folder is missing or not writable.
     """
+    volume = as_volume(volume)
     path = check_saveable(path, batched=volume.batched)
     write = format_of(path).write
     assert write is not None

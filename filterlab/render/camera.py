@@ -192,7 +192,7 @@ class OrthographicCamera(Camera):
 
 def check_size(size: Sequence[int]) -> tuple[int, int]:
     """(width, height) as two positive integers. Raises ValueError otherwise."""
-    values = tuple(size)
+    values = tuple(size) if isinstance(size, Sequence) else ()
     if len(values) != 2 or not all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in values):
         raise ValueError(f"size must be two positive integers (width, height); got {size!r}")
     return values[0], values[1]

@@ -15,13 +15,15 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import SupportsFloat
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from filterlab.fields.base import Field
+from filterlab.fields.grid import GridField
 from filterlab.render.camera import Camera, check_size
 from filterlab.render.rays import Region, check_rays, check_region, intersect, jitter, segment_count, segments
 from filterlab.render.shading import Shading
@@ -65,7 +67,8 @@ def render(
     so that a constant medium has opacity 1 − e^{−τ} at any step, and the error falls with the square of the step.
 
     Args:
-        field: an unbatched field (or signal).
+        field: a field or signal. Of a batched one, (N, C), every entry and channel gives an image of its own, by the
+            same camera, transfer function and lights.
         camera: a Camera, or (origins, directions) `(..., 3)` world rays; directions need not be unit vectors.
         transfer: scalar -> colour c and opacity α per unit.
         size: (width, height) of the image; only with a Camera.
@@ -80,25 +83,32 @@ def render(
             every component. None never stops before a ray is exactly opaque. Ignored when derivatives are asked.
         dtype: float32 or float64, of samples and image.
         device: where to compute; default where the camera, rays or transfer function are.
-        max_samples: refuse images of more samples.
+        max_samples: refuse images of more samples (of all images together).
         memory: bytes that rays and samples in work may take, roughly.
         progress: True shows a progress bar on stderr, None only if that is a terminal; or a function (done, total).
 
     Returns:
         `(H, W, 4)` (or `(..., 4)` for rays): linear RGB *over the background*, and opacity 1 − T. The image over
-        another background b is rgb + (1 − opacity) (b − background). A NaN of the field makes its pixel NaN.
+        another background b is rgb + (1 − opacity) (b − background). A NaN of the field makes its pixel NaN. A batched
+        field gives `(N, C, H, W, 4)` (or `(N, C, ..., 4)`), each image with the bits that its own volume would give.
 
         Differentiable (twice) in whatever the field was built from, camera pose or rays, transfer function, shading and
         background. Blocks of samples are recomputed in the backward pass, so that memory stays bounded then too.
 
+        Differentiate with torch.autograd: the transforms `torch.func.grad`, `vjp` and `vmap` of `render` itself are not
+        supported and raise torch's own RuntimeError. The first two do not allow the recomputation (it saves tensors
+        through hooks); and how many samples exist and which are seen, hence the shapes, depends on the data, which vmap
+        does not allow. Instead of vmap, give a batched field.
+
     Raises:
-        ValueError: a batched field, rays that are not finite, a step that is not positive, more than `max_samples`
+        TypeError: a field, camera, transfer function or shading of another type.
+        ValueError: an empty batch, rays that are not finite, a step that is not positive, more than `max_samples`
             samples (found before anything is rendered), and other arguments out of range.
 
     Source: Max, Optical models for direct volume rendering, 1995; step and opacity as in Engel et al., Real-Time Volume
     Graphics, 2006.
     """
-    _check_arguments(field, camera, step, termination, dtype, max_samples, memory)
+    _check_arguments(field, camera, transfer, shading, step, termination, dtype, max_samples, memory)
     device = torch.device(device or _device_of(camera, transfer))
     view = _View.of(camera, size, device)
     color = _check_background(background, dtype, device)
@@ -125,16 +135,39 @@ def render(
         rays_at_once=_rays_at_once(memory, dtype, differentiable),
     )
     tile = marcher.rays_at_once if differentiable else max(marcher.rays_at_once, memory // (4 * _BYTES_PER_RAY))
+    fields = _unbatched(field)
     with torch.set_grad_enabled(differentiable):
-        total = marcher.count(view, tile, max_samples)
+        total = marcher.count(view, tile, len(fields), max_samples)
         with _reporting(progress, total) as report:
             done, tiles = 0, []
-            for pixels in view.pixels.split(tile):
-                emitted, depth = marcher.march(view, pixels, lambda n, done=done: report(done + n))
-                done += marcher.samples_done
-                tiles.append(_over(emitted, depth[:, None], color))
+            for one in fields:
+                marcher = replace(marcher, field=one)
+                for pixels in view.pixels.split(tile):
+                    emitted, depth = marcher.march(view, pixels, lambda n, done=done: report(done + n))
+                    done += marcher.samples_done
+                    tiles.append(_over(emitted, depth[:, None], color))
             report(total)
-    return torch.cat(tiles).reshape(*view.shape, 4)
+    return torch.cat(tiles).reshape(*(field.channels or ()), *view.shape, 4)
+
+
+def _unbatched(field: Field) -> list[Field]:
+    """The field, or those of all entries and channels of a batched one, in the order of (N, C)."""
+    if field.channels is None:
+        return [field]
+    entries, channels = field.channels
+    select = field.select if isinstance(field, GridField) else lambda n, c: _Selected(field, n, c)
+    return [select(n, c) for n in range(entries) for c in range(channels)]
+
+
+class _Selected(Field):
+    """Entry n and channel c of any batched field; costs as much as the whole field."""
+
+    def __init__(self, field: Field, n: int, c: int) -> None:
+        self.field, self.n, self.c = field, n, c
+        self.domain, self.max_order = field.domain, field.max_order
+
+    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+        return tuple(x[self.n, self.c] for x in self.field.jet(points[None], order))
 
 
 @dataclass(frozen=True)
@@ -200,11 +233,12 @@ class _Marcher:
         return jitter(self.jitter_seed, pixels)
 
     @torch.no_grad()
-    def count(self, view: _View, tile: int, limit: int) -> int:
-        """How many samples the image takes. Raises ValueError above `limit`."""
+    def count(self, view: _View, tile: int, images: int, limit: int) -> int:
+        """How many samples the images take. Raises ValueError above `limit`."""
         total = 0.0
         for pixels in view.pixels.split(tile):
             total += float(segment_count(self.inside(view, pixels)[2], self.step, self.offset(pixels)).sum())
+        total *= images
         if not total <= limit:
             raise ValueError(
                 f"the image would take {total:.3g} samples; the limit is max_samples={limit:.3g}: "
@@ -336,6 +370,8 @@ def _rays_at_once(memory: int, dtype: torch.dtype, differentiable: bool) -> int:
 def _check_arguments(
     field: Field,
     camera: Camera | Rays,
+    transfer: TransferFunction,
+    shading: Shading | None,
     step: float,
     termination: float | None,
     dtype: torch.dtype,
@@ -344,18 +380,21 @@ def _check_arguments(
 ) -> None:
     if not isinstance(field, Field):
         raise TypeError(f"field must be a Field (fl.reconstruct(volume, ...) or a signal); got {type(field).__name__}")
-    if field.channels is not None:
-        raise ValueError(
-            f"render needs an unbatched field; this one has (N, C) = {tuple(field.channels)}: "
-            "reconstruct one (D, H, W) volume at a time"
-        )
+    if field.channels is not None and 0 in field.channels:
+        raise ValueError(f"a batched field must have at least one entry and channel; got (N, C) = {field.channels}")
+    if not 0 < field.domain.voxel_size < math.inf:
+        raise ValueError(f"field.domain.voxel_size must be a positive world length; got {field.domain.voxel_size}")
     pair = isinstance(camera, tuple | list) and len(camera) == 2 and all(isinstance(r, Tensor) for r in camera)
     if not (isinstance(camera, Camera) or pair):
         raise TypeError(f"camera must be a Camera or two tensors (origins, directions); got {type(camera).__name__}")
-    if not 0 < step < math.inf:
-        raise ValueError(f"step must be a positive number of voxels; got {step}")
-    if termination is not None and not 0 < termination < 1:
-        raise ValueError(f"termination must be a transmittance between 0 and 1, or None; got {termination}")
+    if not isinstance(transfer, TransferFunction):
+        raise TypeError(f"transfer must be a TransferFunction; got {type(transfer).__name__}")
+    if not isinstance(shading, Shading | None):
+        raise TypeError(f"shading must be a Shading, or None for unlit; got {type(shading).__name__}")
+    if not isinstance(step, SupportsFloat) or not 0 < step < math.inf:
+        raise ValueError(f"step must be a positive number of voxels; got {step!r}")
+    if termination is not None and (not isinstance(termination, SupportsFloat) or not 0 < termination < 1):
+        raise ValueError(f"termination must be a transmittance between 0 and 1, or None; got {termination!r}")
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64; got {dtype}")
     for name, value in (("max_samples", max_samples), ("memory", memory)):
@@ -364,7 +403,10 @@ def _check_arguments(
 
 
 def _check_background(background: Sequence[float] | Tensor, dtype: torch.dtype, device: torch.device) -> Tensor:
-    color = torch.as_tensor(background, dtype=dtype, device=device)
+    try:
+        color = torch.as_tensor(background, dtype=dtype, device=device)
+    except (TypeError, ValueError):
+        color = torch.empty(0)
     if color.shape != (3,) or not color.detach().isfinite().all() or (color.detach() < 0).any():
         raise ValueError(f"background must be three finite numbers ≥ 0 (linear RGB); got {background!r}")
     return color
@@ -378,7 +420,7 @@ def _device_of(camera: Camera | Rays, transfer: TransferFunction) -> torch.devic
 def _depends_on_parameters(field: Field, dtype: torch.dtype, device: torch.device) -> bool:
     """Whether the field's values carry a gradient of their own: asked of one point, since fields are opaque here."""
     center = torch.tensor([field.domain.center], dtype=dtype, device=device)
-    return field.jet(center, 0)[0].requires_grad
+    return field.jet(center if field.channels is None else center[None], 0)[0].requires_grad
 
 
 @contextmanager

@@ -17,14 +17,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import AfterValidator, Field, ValidationInfo, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 from torch import Tensor
 
 from filterlab import signals
 from filterlab.fields.base import Domain
 from filterlab.fields.base import Field as FilterlabField
+from filterlab.io.bounded import VolumeFileError
 from filterlab.io.config import StrictModel, load_config, unknown_name
-from filterlab.io.volumes import load_volume
+from filterlab.io.volumes import describe, load_volume
 from filterlab.methods import METHODS, reconstruct
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
 from filterlab.render.dvr import Progress, render
@@ -66,6 +67,11 @@ def _named(value: Any) -> Any:
     return {"name": value} if isinstance(value, str) else value
 
 
+# a section that a bare name may stand for is validated as Python data, where a strict tuple would be no list
+_Listed = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
+Parameters = dict[str, float | Annotated[Vector, _Listed]]
+
+
 # --- what is shown ----------------------------------------------------------------------------------------------------
 
 
@@ -91,7 +97,12 @@ class VolumeFile(StrictModel):
         return self
 
     def load(self) -> Volume:
-        """The volume. Raises VolumeFileError for a damaged file."""
+        """The volume. Raises VolumeFileError for a damaged file, or one that holds several volumes."""
+        shape = describe(self.file).shape
+        if len(shape) != 3:
+            raise VolumeFileError(
+                self.file, "one volume of shape (D, H, W) to show", f"a batch (N, C, D, H, W) = {shape}"
+            )
         return load_volume(self.file)
 
 
@@ -120,8 +131,8 @@ class SignalSource(StrictModel):
     """
 
     name: Annotated[str, AfterValidator(_known_signal)]
-    parameters: Annotated[dict[str, float | Vector], Field(default_factory=dict)]
-    samples: Annotated[int, Field(ge=1, le=2048)] | tuple[int, int, int] | None = None
+    parameters: Annotated[Parameters, Field(default_factory=dict)]
+    samples: Annotated[int, Field(ge=1, le=2048)] | Annotated[tuple[int, int, int], _Listed] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -130,18 +141,39 @@ class SignalSource(StrictModel):
 
     @model_validator(mode="after")
     def _accepted(self) -> SignalSource:
-        known = list(inspect.signature(signals.SIGNALS[self.name]).parameters)
-        for parameter in self.parameters:
-            if parameter not in known:
-                raise ValueError(unknown_name(f"parameter of {self.name}", parameter, known))
         if isinstance(self.samples, tuple) and min(self.samples) < 1:
             raise ValueError(f"samples must be positive; got {self.samples}")
-        self.build()
         return self
+
+    @field_validator("parameters")
+    @classmethod
+    def _usable(cls, parameters: Parameters, info: ValidationInfo) -> Parameters:
+        if "name" in info.data:  # else the name is the mistake
+            _check_parameters(info.data["name"], parameters)
+        return parameters
 
     def build(self) -> signals.Signal:
         """The signal."""
         return signals.named(self.name, **self.parameters)  # type: ignore[arg-type]
+
+
+def _check_parameters(name: str, parameters: Parameters) -> None:
+    """Raises ValueError for a parameter that the signal does not have, of another kind, or that gives no numbers."""
+    known = inspect.signature(signals.SIGNALS[name]).parameters
+    for parameter, value in parameters.items():
+        if parameter not in known:
+            raise ValueError(unknown_name(f"parameter of {name}", parameter, known))
+        expected = "three numbers [x, y, z]" if isinstance(known[parameter].default, tuple) else "a number"
+        if isinstance(value, tuple) != isinstance(known[parameter].default, tuple):
+            raise ValueError(f"{parameter}: expected {expected}; got {value}")
+    try:
+        signal = signals.named(name, **parameters)  # type: ignore[arg-type]
+        point = torch.tensor([signal.domain.center], dtype=torch.float64) + 0.1  # nothing special about it
+        finite = all(bool(x.isfinite().all()) for x in signal.value_and_gradient(point))
+    except (ArithmeticError, RuntimeError, TypeError) as error:
+        raise ValueError(f"expected parameters with which {name} can be computed; got {parameters} ({error})") from None
+    if not finite:
+        raise ValueError(f"expected parameters with which {name} is finite; got {parameters}")
 
 
 class Reconstruction(StrictModel):

@@ -29,12 +29,12 @@ class Light:
 
     def __post_init__(self) -> None:
         if self.direction is not None:
-            d = torch.as_tensor(self.direction, dtype=torch.float64).detach()
+            d = _checked("a light's direction", "three finite numbers, or None", self.direction).detach()
             if d.shape != (3,) or not d.isfinite().all() or not d.any():
                 raise ValueError(
                     f"a light's direction must be three finite numbers, not all zero; got {self.direction!r}"
                 )
-        c = torch.as_tensor(self.color, dtype=torch.float64).detach()
+        c = _checked("a light's color", "three finite numbers ≥ 0 (linear RGB)", self.color).detach()
         if c.shape != (3,) or not c.isfinite().all() or (c < 0).any():
             raise ValueError(f"a light's color must be three finite numbers ≥ 0 (linear RGB); got {self.color!r}")
 
@@ -67,11 +67,15 @@ class Shading:
 
     def __post_init__(self) -> None:
         for name, least in (("ambient", 0), ("diffuse", 0), ("specular", 0), ("shininess", 1)):
-            value = _plain(getattr(self, name))
+            number = _checked(name, f"a finite number ≥ {least}", getattr(self, name)).detach()
+            if number.ndim:
+                raise ValueError(f"{name} must be a finite number ≥ {least}; got shape {tuple(number.shape)}")
+            value = number.item()
             if not least <= value < float("inf"):
                 raise ValueError(f"{name} must be a finite number ≥ {least}; got {value}")
-        if not all(isinstance(light, Light) for light in self.lights):
-            raise TypeError(f"lights must be Light objects; got {self.lights!r}")
+        lights = self.lights
+        if not isinstance(lights, Sequence) or not all(isinstance(light, Light) for light in lights):
+            raise TypeError(f"lights must be a sequence of Light objects; got {lights!r}")
 
     @property
     def requires_grad(self) -> bool:
@@ -137,6 +141,14 @@ def _power(base: Tensor, exponent: Tensor) -> Tensor:
 
 def _plain(value: float | Tensor) -> float:
     return float(value.detach() if isinstance(value, Tensor) else value)
+
+
+def _checked(name: str, expected: str, value: Sequence[float] | float | Tensor) -> Tensor:
+    """The value as float64. Raises ValueError that says what was expected."""
+    try:
+        return _numbers(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"{name} must be {expected}; got {value!r}") from None
 
 
 def _numbers(value: Sequence[float] | float | Tensor) -> Tensor:

@@ -221,7 +221,8 @@ def nifti_file(path: Path, *patches: tuple[int, str, tuple]) -> Path:
         ((DIM, "4h", (3, -1, 3, 2)), "sizes from 1"),
         ((DIM, "4h", (3, 0, 3, 2)), "sizes from 1"),
         ((DIM, "4h", (2, 8, 3, 1)), "three axes"),
-        ((DIM, "5h", (4, 2, 2, 2, 3)), "three axes"),
+        ((DIM, "5h", (4, 2, 2, 2, 3)), "a choice among its 3 frames"),
+        ((DIM, "6h", (5, 2, 2, 2, 1, 3)), "three axes"),
         ((DIM, "h", (0,)), "dim[0]"),
         ((DIM, "h", (-3,)), "dim[0]"),
         ((DIM, "h", (200,)), "dim[0]"),
@@ -274,6 +275,33 @@ def test_nifti_truncated_and_endless(tmp_path: Path) -> None:
     ):
         (tmp_path / "b.nii.gz").write_bytes(content)
         refused(tmp_path / "b.nii.gz", word)
+
+
+def test_a_time_series_that_lies(tmp_path: Path) -> None:
+    """A frame is read as carefully as a whole volume, and costs the memory of a frame."""
+
+    def frame(path: Path, index: int = 1) -> Volume:
+        return load_volume(path, frame=index)
+
+    claim = (DIM, "5h", (4, 2000, 2000, 2000, 4))
+    refused(nifti_file(tmp_path / "a.nii", claim), "32000000000 bytes", action=frame)
+    refused(nifti_file(tmp_path / "a.nii.gz", claim), "cannot hold that many", action=frame)
+    refused(nifti_file(tmp_path / "b.nii", (DIM, "5h", (4, 2, 2, 3, 3))), "36 bytes", action=frame)
+    series = (DIM, "5h", (4, 2, 2, 2, 3))
+    whole = nifti_file(tmp_path / "c.nii", series).read_bytes()
+    packed = gzip.compress(whole)
+    for content, word in (
+        (gzip.compress(whole[:-1]), "more bytes"),  # the frame itself is there
+        (gzip.compress(whole[:-9]), "after 7"),
+        (gzip.compress(whole + bytes(2**26)), "more than that"),
+        (packed[:-4] + bytes(4), "damaged or truncated"),
+    ):
+        (tmp_path / "d.nii.gz").write_bytes(content)
+        refused(tmp_path / "d.nii.gz", word, action=frame)
+    (tmp_path / "e.nii").write_bytes(whole[:-1])
+    refused(tmp_path / "e.nii", "24 bytes", action=frame)
+    refused(tmp_path / "c.nii", "at most 7 bytes", action=lambda p: load_volume(p, frame=0, max_bytes=7))
+    assert load_volume(tmp_path / "c.nii", frame=0, max_bytes=8).size == (2, 2, 2)
 
 
 # --- NumPy ------------------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import torch
 
 from filterlab.io import FORMATS, VolumeFileError, describe, load_volume, save_volume
 from filterlab.io.tiff import natural_key
+from filterlab.io.volumes import files_of
 from filterlab.volume import Volume
 from tests.io.writers import (
     AFFINE,
@@ -189,6 +190,63 @@ def test_nifti_trailing_axes_of_one_entry_and_extensions(tmp_path: Path) -> None
     image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", b"a" * 100))
     nibabel.save(image, tmp_path / "a.nii.gz")
     check(tmp_path / "a.nii.gz", SAMPLES.astype(np.uint8), AFFINE)
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "a2.nii"])
+@pytest.mark.parametrize("scaling", [None, 0.5])
+def test_nifti_frames_of_a_time_series(tmp_path: Path, name: str, scaling: float | None) -> None:
+    series = np.stack([SAMPLES + 100 * t for t in range(3)]).astype(np.int16)
+    path = write_nifti(tmp_path / name, series, slope=scaling if name != "a2.nii" else None)
+    other = nibabel.load(path)
+    assert other.shape == (4, 3, 2, 3)
+    for t in range(3):
+        volume = load_volume(path, frame=t)
+        assert np.array_equal(volume.samples.numpy(), other.get_fdata()[..., t].T)
+        assert np.array_equal(volume.affine, other.affine)
+        header = describe(path, frame=t)
+        assert (header.shape, header.dtype) == (volume.shape, volume.dtype)
+        assert header.fields["frame"] == f"{t} of 3"
+
+
+def test_frames_that_cannot_be_chosen(tmp_path: Path) -> None:
+    series = write_nifti(tmp_path / "series.nii", np.stack([SAMPLES] * 3).astype(np.uint8))
+    single = write_nifti(tmp_path / "single.nii", SAMPLES[None].astype(np.uint8))
+    plain = write_nifti(tmp_path / "plain.nii", SAMPLES.astype(np.uint8))
+    other = write_nrrd(tmp_path / "a.nrrd", SAMPLES.astype(np.uint8))
+    for read in (load_volume, describe):
+        with pytest.raises(VolumeFileError, match=r"series\.nii: .*its 3 frames, frame=0 to frame=2.*; got none"):
+            read(series)
+        for frame in (3, -1, 1.0, True):
+            with pytest.raises(VolumeFileError, match=rf"a frame from 0 to 2; got frame {frame}"):
+                read(series, frame=frame)
+        with pytest.raises(VolumeFileError, match="three axes and no time; got frame 0"):
+            read(plain, frame=0)
+        with pytest.raises(VolumeFileError, match="NRRD files hold one volume; got frame 0"):
+            read(other, frame=0)
+        with pytest.raises(VolumeFileError, match="a frame from 0 to 0; got frame 1"):
+            read(single, frame=1)
+    assert torch.equal(load_volume(single).samples, load_volume(single, frame=0).samples)
+
+
+def test_every_file_that_a_volume_comes_from_is_named(tmp_path: Path) -> None:
+    def names(path: Path) -> list[str]:
+        return [str(p.relative_to(tmp_path.resolve())) for p in files_of(path)]
+
+    samples = SAMPLES.astype(np.uint8)
+    assert names(write_nrrd(tmp_path / "a.nrrd", samples)) == ["a.nrrd"]
+    assert names(write_nrrd(tmp_path / "b.nhdr", samples, encoding="raw")) == ["b.nhdr", "b.raw"]
+    write_raw(tmp_path / "c.raw", samples)
+    assert names(tmp_path / "c.raw") == names(tmp_path / "c.raw.yaml") == ["c.raw.yaml", "c.raw"]
+    save_volume(Volume(torch.zeros(2, 3, 4), spacing=2.0), tmp_path / "d.npy")
+    assert names(tmp_path / "d.npy") == ["d.npy", "d.npy.yaml"]
+    save_volume(Volume(torch.zeros(2, 3, 4)), tmp_path / "d.npy")
+    assert names(tmp_path / "d.npy") == ["d.npy"]
+    (tmp_path / "stack").mkdir()
+    for z in (10, 9):
+        tifffile.imwrite(tmp_path / "stack" / f"slice{z}.tif", samples[0])
+    assert names(tmp_path / "stack") == ["stack/slice9.tif", "stack/slice10.tif"]
+    (tmp_path / "link.nrrd").symlink_to(tmp_path / "a.nrrd")
+    assert names(tmp_path / "link.nrrd") == ["a.nrrd"]
 
 
 def test_without_nibabel_the_error_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ from scipy.integrate import quad
 
 from filterlab import signals
 from filterlab.fields.base import Domain, Field
+from filterlab.fields.grid import GridField
 from filterlab.methods import reconstruct
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.rays import intersect, jitter
@@ -442,6 +443,11 @@ def test_mistakes_are_found_before_anything_is_evaluated():
         (ValueError, "dtype", camera, {"dtype": torch.float16}),
         (ValueError, "memory", camera, {"memory": 0}),
         (ValueError, "jitter_seed", camera, {"jitter_seed": -1}),
+        (ValueError, "step must be a positive .* got 'a'", camera, {"step": "a"}),
+        (ValueError, "termination must be .* got 'a'", camera, {"termination": "a"}),
+        (ValueError, "size must be two positive integers .* got 4", camera, {"size": 4}),
+        (ValueError, "background must be three finite numbers .* got 'white'", camera, {"background": "white"}),
+        (TypeError, "shading must be a Shading, or None for unlit; got bool", camera, {"shading": True}),
         (TypeError, "camera must be", "camera", {}),
     ):
         with torch.no_grad(), pytest.raises(error, match=message):
@@ -449,9 +455,87 @@ def test_mistakes_are_found_before_anything_is_evaluated():
     assert field.asked == {0: 0, 1: 0, 2: 0}
     with pytest.raises(TypeError, match="field must be a Field"):
         render(torch.zeros(4, 4, 4), camera, PEAKS, size=(4, 4))  # type: ignore[arg-type]
-    batched = reconstruct(torch.rand(2, 1, 4, 4, 4), "trilinear")
-    with pytest.raises(ValueError, match="unbatched"):
-        render(batched, camera, PEAKS, size=(4, 4))
+    with torch.no_grad(), pytest.raises(TypeError, match="transfer must be a TransferFunction; got function"):
+        render(field, camera, lambda v: v, size=(4, 4))  # type: ignore[arg-type]
+    empty = reconstruct(torch.rand(0, 1, 4, 4, 4), "trilinear")
+    with pytest.raises(ValueError, match=r"at least one entry and channel; got \(N, C\) = \(0, 1\)"):
+        render(empty, camera, PEAKS, size=(4, 4))
+    for voxel_size in (0.0, -1.0, math.nan, math.inf):
+        crooked = Constant(domain=Domain((-0.5, -0.5, -0.5), (3.5, 3.5, 3.5), Geometry(), voxel_size))
+        with pytest.raises(ValueError, match="voxel_size must be a positive world length; got"):
+            render(crooked, camera, PEAKS, size=(4, 4))
+    assert field.asked == {0: 0, 1: 0, 2: 0}
+
+
+# --- batches ----------------------------------------------------------------------------------------------------------
+
+
+class Batch(Field):
+    """Any batched field that is no GridField: (N, C) = (2, 3) scaled Gaussians."""
+
+    signal = signals.gaussian()
+    domain = signal.domain
+    channels = (2, 3)
+
+    def jet(self, points, order):
+        scale = torch.tensor([[1.0, 0.8, 0.6], [0.9, 0.7, 0.5]], dtype=points.dtype)
+        assert points.shape[0] in (1, 2)
+        jet = self.signal.jet(points.expand(2, *points.shape[1:]), order)
+        return tuple(x[:, None] * scale.reshape(2, 3, *(1 for _ in x.shape[1:])) for x in jet)
+
+
+@pytest.mark.parametrize("method", ["triquadratic", "notch", "ncrsi"])
+def test_a_batch_gives_the_bits_of_each_volume_alone(method):
+    batch = torch.rand(2, 3, 7, 6, 8, generator=torch.Generator().manual_seed(2))
+    field = reconstruct(Volume(batch, spacing=(0.1, 0.2, 0.1)), method)
+    camera = camera_for(field)
+    scene = {**SCENE, "jitter_seed": 3, "termination": 0.01}
+    images = render(field, camera, PEAKS, **scene)
+    assert images.shape == (2, 3, 18, 24, 4)
+    for n in range(2):
+        for c in range(3):
+            one = reconstruct(Volume(batch[n, c], spacing=(0.1, 0.2, 0.1)), method)
+            assert torch.equal(images[n, c], render(one, camera, PEAKS, **scene))
+    assert images.reshape(6, -1).unique(dim=0).shape[0] == 6
+    rays = tuple(r[3, 4:9] for r in camera.rays(24, 18))
+    assert render(field, rays, PEAKS).shape == (2, 3, 5, 4)  # type: ignore[arg-type]
+
+
+def test_a_batch_of_any_field_and_one_channel_of_a_grid():
+    field = Batch()
+    camera = camera_for(field)
+    fog = TransferFunction([0.0, 1.0], [[1.0, 0.5, 0.2], [0.2, 0.5, 1.0]], [0.01, 0.3], unit=0.1)
+    images = render(field, camera, fog, size=(6, 5), shading=LIT, dtype=torch.float64)
+    for n, c, scale in ((0, 0, 1.0), (0, 2, 0.6), (1, 1, 0.7)):
+        scaled = TransferFunction(fog.positions / scale, fog.colors, fog.opacities, unit=0.1)
+        expected = render(field.signal, camera, scaled, size=(6, 5), shading=LIT, dtype=torch.float64)
+        torch.testing.assert_close(images[n, c], expected, rtol=0, atol=1e-12)
+    grid = reconstruct(torch.rand(2, 3, 4, 4, 4), "triquadratic")
+    assert isinstance(grid, GridField)
+    one = grid.select(1, 2)
+    assert one.channels is None
+    assert one.coefficients.values.data_ptr() == grid.coefficients.values[1, 2].data_ptr()
+    points = 3 * torch.rand(5, 3)
+    for a, b in zip(one.jet(points, 2), grid.jet(points[None], 2), strict=True):
+        torch.testing.assert_close(a, b[1, 2])
+    assert grid.channels == (2, 3)
+    with pytest.raises(ValueError, match="batched"):
+        one.select(0, 0)
+    with pytest.raises(IndexError):
+        grid.select(2, 0)
+
+
+def test_a_batch_counts_all_of_its_samples():
+    field = Batch()
+    camera = camera_for(field)
+    seen = []
+    with torch.no_grad():
+        render(field, camera, PEAKS, **SCENE, progress=lambda done, total: seen.append((done, total)))
+    one = total_samples(field, camera, 0.9)
+    assert seen[-1] == (6 * one, 6 * one)
+    assert all(a[0] <= b[0] for a, b in pairwise(seen))
+    with pytest.raises(ValueError, match="max_samples"):
+        render(field, camera, PEAKS, **SCENE, max_samples=6 * one - 1)
 
 
 def test_progress_counts_samples_up_to_the_total():

@@ -50,6 +50,30 @@ def test_in_the_volume(method, shading):
     check(lambda v: render(reconstruct(volume(v), method), CAMERA, TRANSFER, shading=shading, **SIZE), samples())
 
 
+def test_in_a_batch_of_volumes():
+    generator = torch.Generator().manual_seed(5)
+    batch = torch.rand(2, 2, 2, 2, 2, generator=generator, dtype=torch.float64).requires_grad_()
+    camera = PerspectiveCamera(position=(-1.0, -3.0, 1.5), target=(1.2, 0.5, -0.6), field_of_view=18.0)
+    dense = TransferFunction(X, RGB, [0.3, 0.5, 0.9])
+    check(lambda v: render(reconstruct(volume(v), "trilinear"), camera, dense, **SIZE), batch)
+    (derivative,) = torch.autograd.grad(
+        render(reconstruct(volume(batch), "trilinear"), camera, TRANSFER, **SIZE)[1, 0].sum(), batch
+    )
+    assert derivative[1, 0].any()
+    assert not derivative[0].any()
+    assert not derivative[1, 1].any()
+
+
+def test_transforms_of_torch_func_are_refused_and_not_wrong():
+    def brightness(v):
+        return render(reconstruct(volume(v), "trilinear"), CAMERA, TRANSFER, **SIZE).sum()
+
+    v = samples().detach()
+    for transform, inputs in ((torch.func.grad, v), (torch.func.vmap, torch.stack((v, v)))):
+        with pytest.raises(RuntimeError, match=r"torch\.func|vmap"):
+            transform(brightness)(inputs)
+
+
 def test_in_the_pose_of_a_pinhole():
     def function(position, target, up, angle):
         camera = PerspectiveCamera(position=position, target=target, up=up, field_of_view=angle)

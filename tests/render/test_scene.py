@@ -1,5 +1,6 @@
 """Scenes: what they build, that they say what is wrong, and that the example scenes are valid."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -129,6 +130,13 @@ def test_volume_files_are_found_beside_the_scene_and_by_variables(scene_file, tm
         ({"method": "noch"}, "method.*did you mean 'notch'.*trilinear"),
         ({"signal.name": "marschner"}, "signal.*known signals.*franke"),
         ({"signal.parameters": "{frequenzy: 3}"}, "frequenzy.*did you mean 'frequency'"),
+        (
+            {"signal": "{name: plane-wave, samples: 8, parameters: {wave_vector: 3}}"},
+            r"signal\.parameters: wave_vector: expected three numbers \[x, y, z\]; got 3",
+        ),
+        ({"signal.parameters": "{frequency: [1, 2, 3]}"}, r"signal\.parameters: frequency: expected a number; got \(1"),
+        ({"signal.parameters": "{voxel_size: -1}"}, r"signal\.parameters: voxel_size.*positive"),
+        ({"signal.parameters": "{frequency: 1e308}"}, r"signal\.parameters: .*marschner-lobb is finite; got .*1e\+308"),
         ({"method": "{name: notch, boundary: periodic}"}, "known boundarys|boundary.*wrap"),
         ({"method": "{name: tricubic, gradient: central}"}, "offers the gradients analytic"),
         ({"signal.samples": "null", "method": "notch"}, "needs no method"),
@@ -153,6 +161,33 @@ def test_volume_files_are_found_beside_the_scene_and_by_variables(scene_file, tm
 def test_mistakes_name_the_key_and_the_known_names(scene_file, overrides, message):
     with pytest.raises(ConfigError, match=message):
         load_scene(scene_file(MINIMAL), overrides)
+
+
+def test_vectors_of_a_signal(scene_file):
+    text = "{name: plane-wave, samples: [4, 5, 6], parameters: {wave_vector: [1, 2, 3.5], phase: 1}}"
+    scene = load_scene(scene_file(MINIMAL), {"signal": text})
+    assert scene.signal is not None
+    assert scene.signal.samples == (4, 5, 6)
+    point = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    assert scene.signal.build()(point).item() == pytest.approx(math.cos(0.1 + 0.4 + 1.05 + 1), rel=1e-12)
+    assert load_scene(scene_file(dump_config(scene))) == scene
+
+
+def test_a_signal_that_cannot_be_computed_is_refused(scene_file, monkeypatch):
+    def broken(slope: float = 1.0) -> signals.Signal:
+        return signals.Signal("broken", lambda p: (p @ p.new_tensor(slope), p))
+
+    monkeypatch.setitem(signals.SIGNALS, "broken", broken)
+    with pytest.raises(ConfigError, match=r"signal\.parameters: expected parameters with which broken can be computed"):
+        load_scene(scene_file(MINIMAL), {"signal": "{name: broken, parameters: {slope: 2}}"})
+
+
+def test_a_scene_shows_one_volume(scene_file, tmp_path, monkeypatch):
+    save_volume(torch.rand(1, 2, 3, 4, 5), tmp_path / "batch.npz")
+    path = scene_file(MINIMAL.replace("signal: {name: marschner-lobb, samples: 12}", "volume: batch.npz"))
+    monkeypatch.setattr("filterlab.render.scene.load_volume", lambda *_: pytest.fail("the voxels must not be read"))
+    with pytest.raises(ValueError, match=r"batch\.npz: expected one volume of shape \(D, H, W\).*\(1, 2, 3, 4, 5\)"):
+        render_scene(load_scene(path))
 
 
 def test_a_volume_and_a_signal_are_too_much_and_none_too_little(scene_file, tmp_path):

@@ -108,8 +108,19 @@ def test_brightest_bounds_lit_colors():
         (lambda: Shading(diffuse=math.inf), "diffuse"),
         (lambda: Shading(specular=math.nan), "specular"),
         (lambda: Shading(shininess=0.5), "shininess"),
+        (lambda: Light("a"), "light's direction must be three finite numbers, or None; got 'a'"),
+        (lambda: Light(None, "red"), "light's color must be three finite numbers ≥ 0 .* got 'red'"),
+        (lambda: Light((1.0, 2.0, "z")), "light's direction must be three finite numbers"),
+        (lambda: Shading(ambient="a"), "ambient must be a finite number ≥ 0; got 'a'"),
+        (lambda: Shading(specular=(1.0, 2.0)), "specular must be a finite number"),
     ],
 )
 def test_mistakes(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("lights", [True, Light(), [(0.0, 0.0, 1.0)], "a"])
+def test_lights_are_lights(lights):
+    with pytest.raises(TypeError, match="lights must be a sequence of Light objects; got"):
+        Shading(lights)
