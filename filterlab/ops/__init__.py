@@ -1,6 +1,7 @@
 """The numerical core: `jet` and its adjoint `splat`. Every evaluation in filterlab goes through these two.
 
-`jet` and `splat` here choose the implementation; `reference` is plain torch, `autograd` makes the pair differentiable.
+`jet` and `splat` here choose the implementation: `reference` is plain torch, `cpu` fused vector code; `autograd` makes
+the pair differentiable, whichever computes it.
 """
 
 from __future__ import annotations
@@ -10,10 +11,11 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from filterlab.kernels import Kernel, PiecewisePolynomial
-from filterlab.ops import autograd, reference
+from filterlab.ops import autograd, cpu, reference
+from filterlab.ops.autograd import IMPLEMENTATIONS
 from filterlab.ops.reference import multi_indices
 
-__all__ = ["jet", "multi_indices", "splat"]
+__all__ = ["IMPLEMENTATIONS", "jet", "multi_indices", "splat"]
 
 
 def _per_axis(kernels: PiecewisePolynomial | Sequence[PiecewisePolynomial]) -> tuple[PiecewisePolynomial, ...]:
@@ -34,12 +36,22 @@ def _check(
             raise ValueError(f"axis {axis} has {n} coefficients; the kernel {kernel.name} needs {kernel.support}")
 
 
+def _check_implementation(
+    name: str, values: Tensor, points: Tensor, kernels: Sequence[PiecewisePolynomial], order: int, *sizes
+) -> None:
+    if name not in IMPLEMENTATIONS:
+        raise ValueError(f"implementation must be one of {', '.join(IMPLEMENTATIONS)}; got {name!r}")
+    if name == "cpu" and (why := cpu.missing(values, points, kernels, order, *sizes)):
+        raise ValueError(f"implementation 'cpu' can't run here: {why}; implementation='reference' can")
+
+
 def jet(
     coefficients: Tensor,
     points: Tensor,
     kernels: PiecewisePolynomial | Sequence[PiecewisePolynomial],
     order: int = 0,
     start: int = 0,
+    implementation: str = "reference",
 ) -> Tensor:
     """All partial derivatives up to `order` of Σ_k c_k φ_x(x−k_x) φ_y(y−k_y) φ_z(z−k_z) at the points.
 
@@ -50,18 +62,24 @@ def jet(
         kernels: one kernel, or one per axis x, y, z.
         order: 0 value, 1 + gradient, 2 + Hessian, …; rows as in `multi_indices(order)`.
         start: the coordinate of coefficient 0, the same along every axis (negative for padded coefficients).
+        implementation: a key of `IMPLEMENTATIONS`: "reference" (plain torch) or "cpu" (fused; see `cpu.missing` for
+            what it needs). Derivatives are computed by the same one, those above order 3 by the reference.
 
     Returns:
         (N, C, J, M) in the dtype of the points.
 
     Differentiable any number of times in coefficients and points; in the tables of `TensorKernel`s too.
+
+    Raises:
+        ValueError: wrong shapes; an unknown implementation, or one that can't run as asked (the message says why).
     """
     kernels = _per_axis(kernels)
     if coefficients.ndim != 5:
         raise ValueError(f"coefficients must have shape (N, C, D, H, W); got {tuple(coefficients.shape)}")
     _check(coefficients, points, kernels, order, coefficients.shape[2:])
+    _check_implementation(implementation, coefficients, points, kernels, order, None, start)
     if all(isinstance(k, Kernel) for k in kernels):
-        return autograd.jet(coefficients, points, kernels, order, start)  # type: ignore[arg-type]
+        return autograd.jet(coefficients, points, kernels, order, start, implementation)  # type: ignore[arg-type]
     return reference.jet(coefficients, points, kernels, order, start)
 
 
@@ -72,12 +90,13 @@ def splat(
     order: int,
     shape: Sequence[int],
     start: int = 0,
+    implementation: str = "reference",
 ) -> Tensor:
     """The adjoint of `jet`: ⟨jet(c), g⟩ = ⟨c, splat(g)⟩.
 
     Args:
         cotangents: (N, C, J, M), as `jet` returns.
-        points, kernels, order, start: as for `jet`.
+        points, kernels, order, start, implementation: as for `jet`.
         shape: (D, H, W) of the result.
 
     Returns:
@@ -88,6 +107,15 @@ def splat(
     if cotangents.ndim != 4 or cotangents.shape[2:] != (rows, points.shape[1]):
         raise ValueError(f"cotangents must have shape (N, C, {rows}, M); got {tuple(cotangents.shape)}")
     _check(cotangents, points, kernels, order, shape)
+    _check_implementation(implementation, cotangents, points, kernels, order, shape, start)
     if all(isinstance(k, Kernel) for k in kernels):
-        return autograd.splat(cotangents, points, kernels, order, tuple(shape), start)  # type: ignore[arg-type]
+        return autograd.splat(
+            cotangents,
+            points,
+            kernels,  # type: ignore[arg-type]
+            order,
+            tuple(shape),
+            start,
+            implementation,
+        )
     return reference.splat(cotangents, points, kernels, order, shape, start)

@@ -1,0 +1,71 @@
+"""The fused kernels touch nothing outside their arrays: each ends, then begins, at a page that may not be touched.
+
+The check runs in a process of its own: a violation kills it.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+CHECK = r'''
+import ctypes, itertools, mmap
+import torch
+from filterlab.kernels import CATMULL_ROM, LINEAR, bspline
+from filterlab.ops import cpu, multi_indices, reference
+
+PAGE = mmap.PAGESIZE
+libc = ctypes.CDLL(None, use_errno=True)
+keep = []
+
+def guarded(tensor, at_end):
+    """A copy between two pages without access, touching the second (at_end) or the first."""
+    size = tensor.numel() * tensor.element_size()
+    inner = -(-size // PAGE) * PAGE
+    region = mmap.mmap(-1, inner + 2 * PAGE)
+    address = ctypes.addressof(ctypes.c_char.from_buffer(region))
+    offset = PAGE + (inner - size if at_end else 0)
+    copy = torch.frombuffer(region, dtype=tensor.dtype, count=tensor.numel(), offset=offset).reshape(tensor.shape)
+    copy.copy_(tensor)
+    for page in (address, address + PAGE + inner):
+        assert libc.mprotect(ctypes.c_void_p(page), ctypes.c_size_t(PAGE), 0) == 0
+    keep.append(region)
+    return copy
+
+torch.manual_seed(0)
+wild = torch.tensor([0.0, -0.0, 1e30, -1e30, float("inf"), -float("inf"), float("nan"), 3e9, -3e9, 1e10, 2**31, -2**31,
+                     2**24, 6.5, 1e-45])
+cases = itertools.product(
+    [(LINEAR,) * 3, (bspline(2),) * 3, (bspline(5),) * 3, (bspline(0), CATMULL_ROM, bspline(4))],
+    [(torch.float32, torch.float32), (torch.float64, torch.float64), (torch.float32, torch.uint8)],
+)
+for kernels, (dtype, stored) in cases:
+    shape = tuple(k.support + 1 for k in kernels[::-1])
+    for at_end in (True, False):
+        for m in (1, 3, 8, 13):
+            points = torch.rand(2, m, 3, dtype=dtype) * 12 - 3
+            choose = torch.rand(2, m, 3) < 0.4
+            points = torch.where(choose, wild[torch.randint(len(wild), (2, m, 3))].to(dtype), points)
+            points = guarded(points, at_end)
+            coefficients = guarded((torch.rand(2, 2, *shape) * 100).to(stored), at_end)
+            rows = guarded(torch.full((2, 2, 4, m), 7, dtype=dtype), at_end)
+            cpu._run("jet", [coefficients], points, rows, kernels, 1, 0)
+            expected = reference.jet(coefficients, points, kernels, 1, 0)
+            fine = ((points > -50) & (points < 50)).all(-1)[:, None, None].expand_as(rows)
+            assert torch.allclose(rows[fine], expected[fine], rtol=1e-3, atol=1e-2 * float(expected[fine].abs().sum()))
+            if stored == dtype:
+                cpu._run("splat", [coefficients], points, rows, kernels, 1, 0)
+print("nothing outside was touched")
+'''
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="guard pages are made with mprotect")
+def test_nothing_outside_the_arrays_is_touched() -> None:
+    result = subprocess.run(
+        [sys.executable, "-c", CHECK], env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True
+    )
+    assert result.returncode == 0, f"exit status {result.returncode}: {result.stderr}"
+    assert "nothing outside was touched" in result.stdout
