@@ -9,9 +9,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+import torch
 from torch import Tensor
 
-from filterlab import kernels, prefilters
+from filterlab import kernels, ops, prefilters
 from filterlab.fields.base import Field
 from filterlab.fields.grid import Coefficients, GridField, Scheme, Term
 from filterlab.fields.ncrsi import NCRSI_TERMS, SevenSamples
@@ -122,17 +123,21 @@ class Method:
             interpolating_without_prefilter=self.kernel.interpolating,
             prefiltered=not self.prefilter.is_identity,
             gradients=self.gradients,
-            schemes=("direct",) if self.sampled is None else ("direct", "eight_trilinear"),
+            schemes=self.schemes,
         )
+
+    @property
+    def schemes(self) -> tuple[str, ...]:
+        """The ways of evaluating it, the default first."""
+        return ("direct", "fused") if self.sampled is None else ("direct", "fused", "eight_trilinear")
 
     def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> Scheme:
         """The scheme of that name with that kind of gradient (None: the default of either).
 
         Raises ValueError for a name or a combination that the method does not offer, with those it does.
         """
-        offered = ("direct",) if self.sampled is None else ("direct", "eight_trilinear")
-        if name not in (None, *offered):
-            raise ValueError(f"method {self.name} offers the schemes {', '.join(offered)}; got {name!r}")
+        if name not in (None, *self.schemes):
+            raise ValueError(f"method {self.name} offers the schemes {', '.join(self.schemes)}; got {name!r}")
         if gradient not in (None, *self.gradients):
             raise ValueError(f"method {self.name} offers the gradients {', '.join(self.gradients)}; got {gradient!r}")
         if name == "eight_trilinear":
@@ -144,9 +149,9 @@ class Method:
             assert self.sampled is not None
             return self.sampled(named_sampler(sampler))
         if sampler != "exact":
-            raise ValueError(f"sampler={sampler!r} needs scheme='eight_trilinear'; the direct sum takes no samples")
+            raise ValueError(f"sampler={sampler!r} needs scheme='eight_trilinear'; a sum over taps takes no samples")
         analytic = (gradient or self.gradients[0]) == "analytic"
-        return Direct(self.value_terms) if analytic else DirectCentral(self.value_terms)
+        return (Direct if analytic else DirectCentral)(self.value_terms, name or "direct")
 
 
 def _invertible(kernel: Kernel) -> bool:
@@ -171,7 +176,7 @@ METHODS: dict[str, Method] = {
         Method("catmull-rom", "interpolating cubic spline along each axis", kernels.CATMULL_ROM),
         Method(
             "ncrsi",
-            "nonseparable Catmull-Rom: trilinear samples and central differences, order three for free",
+            "nonseparable Catmull-Rom: order three from the samples of central differences",
             kernels.CATMULL_ROM,
             gradients=("central", "analytic"),
             sampled=SevenSamples,
@@ -254,8 +259,9 @@ def reconstruct(
             prefilter with which it does, a `TensorKernel` has none and needs prefilter=False.
         boundary: how the samples go on beyond the ends: mirror, reflect, wrap, border or zeros.
         prefilter: False to sum the samples themselves (blurs with a kernel that does not interpolate).
-        scheme: `direct` (default) or, where the method offers it, `eight_trilinear` (for trilinear, whose gradient it
-            takes by central differences, together with gradient="central").
+        scheme: `direct` (default; plain torch, any device), `fused` (the same sum in vector code compiled for this
+            processor, 3 to 13 times as fast along a ray) or, where the method offers it, `eight_trilinear` (for
+            trilinear, whose gradient it takes by central differences, together with gradient="central").
         gradient: `analytic` or `central`, where the method offers both; default: the method's own.
         sampler: for `eight_trilinear`: `exact`, `texture_unit` (8-bit fractions) or a callable.
 
@@ -264,7 +270,8 @@ def reconstruct(
         `TensorKernel`. Prefiltered coefficients are stored as promote(samples, float32), others as the samples are.
 
     Raises:
-        ValueError: unknown name, or a combination that the method does not offer.
+        ValueError: unknown name, a combination that the method does not offer, or a fused scheme that cannot run here
+            (the message says what is missing).
     """
     if prefilter and isinstance(method, TensorKernel):
         raise ValueError(f"the kernel {method.name} is a TensorKernel and has no prefilter; pass prefilter=False")
@@ -279,4 +286,14 @@ def reconstruct(
         chosen.reach,
         method.factor,
     )
+    if chosen.name == "fused" and (why := _missing_for_fused(coefficients, chosen)):
+        raise ValueError(f"scheme='fused' can't run here: {why}; scheme='direct' can")
     return GridField(method.name, volume, coefficients, chosen)
+
+
+def _missing_for_fused(coefficients: Coefficients, scheme: Scheme) -> str | None:
+    """What the fused sum lacks for these coefficients, or None."""
+    values = coefficients.values.detach().reshape(-1, 1, *coefficients.values.shape[-3:])
+    points = torch.empty(values.shape[0], 0, 3, device=values.device)
+    reasons = (ops.cpu.missing(values, points, term.kernels, 1) for term in scheme.terms)
+    return next((why for why in reasons if why), None)

@@ -96,20 +96,43 @@ class Boundary(StrEnum):
         """
         return _Fold.apply(x, self, n, tail)  # type: ignore[return-value]
 
+    def _interval(self, n: int, tail: int) -> tuple[float, float]:
+        """Where folded coordinates lie."""
+        match self:
+            case Boundary.MIRROR:
+                return 0.0, n - 1.0
+            case Boundary.REFLECT:
+                return -0.5, n - 0.5
+            case Boundary.WRAP:
+                return 0.0, float(n)
+            case _:
+                return -float(tail), n - 1.0 + tail
+
     def _fold(self, x: Tensor, n: int, tail: int) -> tuple[Tensor, Tensor]:
-        one = torch.ones_like(x)
+        low, high = self._interval(n, tail)
+        one = x.new_ones(()).expand_as(x)
+        if high > low and _all_between(x, low, high):
+            return x.clone(), one
         match self:
             case Boundary.MIRROR if n == 1:
                 return torch.where(x.isfinite(), torch.zeros_like(x), torch.full_like(x, torch.nan)), 0 * one
-            case Boundary.MIRROR:
-                return _reflect_at(x, 0.0, n - 1.0)
-            case Boundary.REFLECT:
-                return _reflect_at(x, -0.5, n - 0.5)
+            case Boundary.MIRROR | Boundary.REFLECT:
+                return _reflect_at(x, low, high)
             case Boundary.WRAP:
-                return torch.where((x >= 0) & (x <= n), x, x.remainder(float(n))), one
+                return torch.where((x >= low) & (x <= high), x, x.remainder(high)), one
             case _:
-                low, high = -float(tail), n - 1.0 + tail
                 return x.clamp(low, high), torch.where((x < low) | (x > high), 0 * one, one)
+
+
+def _all_between(x: Tensor, low: float, high: float) -> bool:
+    """Whether every coordinate is known to lie inside: the common case, in which there is nothing to fold.
+
+    Looked at on the CPU only: elsewhere the answer would have to be waited for. False where there is a NaN.
+    """
+    if x.device.type != "cpu" or x.numel() == 0:
+        return False
+    least, most = torch.aminmax(x)
+    return low <= float(least) and float(most) <= high
 
 
 class _Fold(torch.autograd.Function):

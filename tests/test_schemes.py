@@ -8,6 +8,7 @@ import torch
 
 from filterlab.fields.base import Field
 from filterlab.fields.tensor_product import SAMPLERS, exact_sample
+from filterlab.kernels import bc
 from filterlab.methods import METHODS, reconstruct
 from filterlab.volume import Boundary
 from tests import laws, oracles
@@ -165,3 +166,22 @@ def test_a_field_says_what_it_is():
     field = reconstruct(volume(), "notch", scheme="eight_trilinear", boundary="wrap")
     for word in ("notch", "eight_trilinear", "analytic", "wrap", "float64"):
         assert word in repr(field)
+
+
+def test_a_fused_scheme_that_cannot_run_says_what_is_missing():
+    kernel = bc(torch.tensor(0.3), torch.tensor(0.3))
+    with pytest.raises(ValueError, match=r"can't run here: .*TensorKernel.*; scheme='direct' can"):
+        reconstruct(volume(), kernel, prefilter=False, scheme="fused")
+
+
+@pytest.mark.parametrize("method", list(METHODS))
+def test_fused_differentiates_like_direct(method):
+    for boundary in ("mirror", "zeros"):
+        results = []
+        for scheme in ("direct", "fused"):
+            samples, at = volume().requires_grad_(), points(beyond=0.8).requires_grad_()
+            value, gradient = reconstruct(samples, method, boundary=boundary, scheme=scheme).jet(at, 1)
+            loss = value.square().sum() + gradient.square().sum()
+            results.append(torch.autograd.grad(loss, (samples, at)))
+        for got, want in zip(*results, strict=True):
+            laws.assert_close(got, want, 1e-12)

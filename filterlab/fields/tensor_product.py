@@ -1,8 +1,9 @@
-"""Schemes for separable kernels: the direct sum over taps, and linear combinations of trilinear samples.
+"""Schemes for separable kernels: the sum over taps, and linear combinations of trilinear samples.
 
-`direct` sums S³ taps. `eight_trilinear` is what a texture unit wants: eight trilinear samples for a triquadratic value
-*and* its gradient (the paper's contribution), 8 + 24 for a tricubic one (Sigg & Hadwiger). The trilinear sample itself
-is pluggable; one sampler models the 8-bit fractions of a texture unit.
+`direct` sums S³ taps in plain torch, `fused` the same in compiled vector code. `eight_trilinear` is what a texture unit
+wants: eight trilinear samples for a triquadratic value *and* its gradient (the paper's contribution), 8 + 24 for a
+tricubic one (Sigg & Hadwiger). The trilinear sample itself is pluggable; one sampler models the 8-bit fractions of a
+texture unit.
 """
 
 from __future__ import annotations
@@ -93,9 +94,16 @@ CENTRAL_TERMS = tuple(along(axis, CENTRAL_DIFFERENCE) for axis in range(3))
 """∂f/∂x_d ≈ (T(x + e_d) − T(x − e_d)) / 2 with T the trilinear interpolant: each is a separable sum itself."""
 
 
+IMPLEMENTATION_OF = {"direct": "reference", "fused": "cpu"}
+"""The sum over taps goes by the name of what computes it."""
+
+
 @dataclass(frozen=True)
 class Direct:
-    """The sum over taps, Σ_terms weight · Σ_k c_k φ_x φ_y φ_z, with analytic derivatives up to the Hessian."""
+    """The sum over taps, Σ_terms weight · Σ_k c_k φ_x φ_y φ_z, with analytic derivatives up to the Hessian.
+
+    `direct` computes it in plain torch, `fused` in vector code made for this processor (`ops.cpu`).
+    """
 
     terms: tuple[Term, ...]
     name: str = "direct"
@@ -108,7 +116,8 @@ class Direct:
 
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
         values, start = coefficients.values, coefficients.start
-        parts = [ops.jet(values, points, term.kernels, order, start) for term in self.terms]
+        implementation = IMPLEMENTATION_OF[self.name]
+        parts = [ops.jet(values, points, term.kernels, order, start, implementation) for term in self.terms]
         if len(parts) == 1 and self.terms[0].weight == 1:
             return parts[0]
         return sum(
@@ -130,10 +139,10 @@ class DirectCentral:
         return reach_of((*self.terms, *CENTRAL_TERMS))
 
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
-        value = Direct(self.terms).jet(coefficients, points, 0)
+        value = Direct(self.terms, self.name).jet(coefficients, points, 0)
         if order == 0:
             return value
-        differences = [Direct((term,)).jet(coefficients, points, 0) for term in CENTRAL_TERMS]
+        differences = [Direct((term,), self.name).jet(coefficients, points, 0) for term in CENTRAL_TERMS]
         return torch.cat([value, *differences], 2)
 
 
