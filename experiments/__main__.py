@@ -16,14 +16,16 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from experiments.config import known_configs
+from experiments.config import input_files, known_configs
 from experiments.registry import Experiment, experiment_of, load
 from experiments.report.write import write_report
-from experiments.runs import Run, RunError, Unit, provenance, run_folder
+from experiments.runs import Record, Run, RunError, Unit, provenance, run_folder
 from filterlab.io import VolumeFileError
 from filterlab.io.config import ConfigError
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+_NO_MEMORY = "expected enough memory; there is not: use a smaller resolution, image or number of points"
+_ALLOCATOR_SAYS = ("DefaultCPUAllocator", "can't allocate memory", "out of memory", "Storage size calculation overflow")
 OWN_OPTIONS = ("--fresh", "--runs", "--help")
 
 USAGE_TEXT = """
@@ -130,12 +132,14 @@ def _run(options: argparse.Namespace, overrides: dict[str, str], arguments: list
     name, experiment, config = load(options.config, overrides)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    folder = run_folder(options.runs, name, config, fresh=options.fresh)
+    inputs = input_files(config)
+    folder = run_folder(options.runs, name, config, inputs, fresh=options.fresh)
     command = shlex.join(["python", "-m", "experiments", *(a for a in arguments if a != "--fresh")])
-    with Run.open(folder, config, provenance(config.device, config.seed, command)) as run:
+    with Run.open(folder, config, provenance(config.device, config.seed, command, inputs)) as run:
         units = experiment.units(config)
         left = [unit for unit in units if not run.done(unit.key)]
         _announce(name, config.description, units, left, folder)
+        _warn_of_other_code(run)
         try:
             _work(experiment, config, run, units, left)
         except KeyboardInterrupt:
@@ -158,6 +162,21 @@ def _announce(name: str, description: str, units: list[Unit], left: list[Unit], 
     print(f"{kept}{len(left)} to do, about {expected} on two cores", file=sys.stderr)
 
 
+def _warn_of_other_code(run: Run) -> None:
+    others = run.made_by_other_code()
+    if others:
+        made = ", ".join(dict.fromkeys(_code(start) for start in others))
+        print(
+            f"warning: records kept in {run.folder} were computed by other code ({made}) than what runs now "
+            f"({_code(run.start)}); this run mixes records of both. --fresh computes everything anew",
+            file=sys.stderr,
+        )
+
+
+def _code(start: Record) -> str:
+    return f"filterlab {start.get('filterlab')}, commit {start.get('commit') or 'unknown'}"
+
+
 def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{max(round(seconds), 1)} s"
@@ -169,9 +188,25 @@ def _work(experiment: Experiment, config: Any, run: Run, units: list[Unit], left
         for unit in left:
             shown.begin(unit)
             start = time.perf_counter()
-            record = experiment.compute(config, unit, run)
+            record = _computed(experiment, config, unit, run)
             run.append(unit.key, {**record, "seconds": time.perf_counter() - start})
             shown.end(unit)
+
+
+def _computed(experiment: Experiment, config: Any, unit: Unit, run: Run) -> Record:
+    """The record of a unit. What only the work itself could find to be wrong with a config becomes a RunError."""
+    try:
+        return experiment.compute(config, unit, run)
+    except (RunError, ConfigError, VolumeFileError):
+        raise
+    except MemoryError:
+        raise RunError(f"{unit.label}: {_NO_MEMORY}") from None
+    except ValueError as error:
+        raise RunError(f"{unit.label}: {' '.join(str(error).split())}") from error
+    except RuntimeError as error:
+        if isinstance(error, torch.OutOfMemoryError) or any(words in str(error) for words in _ALLOCATOR_SAYS):
+            raise RunError(f"{unit.label}: {_NO_MEMORY} ({str(error).splitlines()[0]})") from error
+        raise
 
 
 @contextmanager

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
+import inspect
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,8 +17,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 import filterlab as fl
 from filterlab import signals
-from filterlab.io import describe, load_volume
+from filterlab.fields.base import Domain
+from filterlab.io import VolumeHeader, describe, load_volume
 from filterlab.io.config import ConfigError, Problem, StrictModel, load_config, unknown_name
+from filterlab.io.volumes import files_of
 from filterlab.render.scene import find_volume
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
@@ -65,9 +69,7 @@ class Recipe(StrictModel):
     @property
     def gradient_kind(self) -> str:
         """`analytic` or `central`: what is used, the method's default where none is asked for."""
-        method = fl.METHODS[self.method]
-        default = method.gradients[0] if self.scheme == "direct" else method.sampled_gradient
-        return self.gradient or default
+        return self.gradient or fl.METHODS[self.method].gradients[0]
 
     @property
     def declared_order(self) -> int:
@@ -113,7 +115,8 @@ class Recipe(StrictModel):
         }
 
 
-def _distinct(recipes: list[Recipe]) -> list[Recipe]:
+def distinct(recipes: list[Recipe]) -> list[Recipe]:
+    """The recipes. Raises ValueError unless they are all different."""
     seen: set[str] = set()
     for recipe in recipes:
         if recipe.key in seen:
@@ -122,7 +125,7 @@ def _distinct(recipes: list[Recipe]) -> list[Recipe]:
     return recipes
 
 
-Recipes = Annotated[list[Recipe], Field(min_length=1), AfterValidator(_distinct)]
+Recipes = Annotated[list[Recipe], Field(min_length=1), AfterValidator(distinct)]
 
 
 class SignalChoice(StrictModel):
@@ -138,17 +141,34 @@ class SignalChoice(StrictModel):
 
     @model_validator(mode="after")
     def _accepted(self) -> SignalChoice:
+        known = inspect.signature(signals.SIGNALS[self.name]).parameters
+        for name, value in self.parameters.items():
+            if name not in known:
+                raise ValueError(unknown_name(f"parameter of {self.name}", name, known))
+            vector = isinstance(known[name].default, tuple)
+            if isinstance(value, list) != vector or (isinstance(value, list) and len(value) != 3):
+                expected = "three numbers [x, y, z]" if vector else "a number"
+                raise ValueError(f"expected {expected} as {name}; got {value}")
         self.build()
         return self
+
+    def check(self, path: str) -> signals.Signal:
+        """The signal. Raises ConfigError, for the key at `path`, unless it is finite at a point like any other."""
+        told = f"expected parameters with which {self.name} has finite values; got {self.parameters}"
+        try:
+            signal = self.build()
+            point = torch.tensor([signal.domain.center], dtype=torch.float64) + 0.1 * signal.domain.voxel_size
+            found = signal.value_and_gradient(point)
+        except (ArithmeticError, RuntimeError, TypeError) as error:
+            raise ConfigError([Problem(self.label, path, f"{told} ({_first_line(error)})")]) from None
+        if not all(bool(x.isfinite().all()) for x in found):
+            raise ConfigError([Problem(self.label, path, told)])
+        return signal
 
     def build(self) -> signals.Signal:
         """The signal."""
         parameters = {k: tuple(v) if isinstance(v, list) else v for k, v in self.parameters.items()}
-        try:
-            return signals.named(self.name, **parameters)  # type: ignore[arg-type]
-        except TypeError as error:
-            known = signals.SIGNALS[self.name].__code__.co_varnames[: signals.SIGNALS[self.name].__code__.co_argcount]
-            raise ValueError(f"{self.name} takes {', '.join(known)}; {error}") from None
+        return signals.named(self.name, **parameters)  # type: ignore[arg-type]
 
     @property
     def label(self) -> str:
@@ -162,7 +182,7 @@ class VolumeChoice(StrictModel):
 
     Attributes:
         file: a path, a file in the folder of $FILTERLAB_VOLUMES, or `package:path` (see `volume_path`).
-        frame: which volume of a NIfTI time series, which `load_volume` refuses as a whole.
+        frame: which volume of a NIfTI time series; see `filterlab.load_volume`.
     """
 
     file: Annotated[str, Field(min_length=1)]
@@ -173,48 +193,60 @@ class VolumeChoice(StrictModel):
     def _from_name(cls, value: Any) -> Any:
         return {"file": value} if isinstance(value, str) else value
 
-    def check(self, path: str) -> None:
-        """Raises ConfigError for the key at `path` unless the file is there with a sound header; reads no voxels."""
+    def check(self, path: str) -> Domain:
+        """The domain of the volume, by its header: no voxels are read.
+
+        Raises ConfigError for the key at `path` unless the file is there with a sound header of one volume.
+        """
         try:
-            file = volume_path(self.file)
-            if self.frame is None:
-                describe(file)
-            else:
-                _time_series(file, self.frame)
-        except (ValueError, OSError, ImportError) as error:
+            header = self._header()
+            if len(header.shape) != 3:
+                raise ValueError(f"expected one volume (D, H, W); got {header.shape} in {header.path}")
+        except (ValueError, OSError) as error:
             raise ConfigError([Problem(self.file, path, str(error))]) from None
+        return Domain.of_grid(header.size, header.geometry)
 
     def extent(self) -> float:
         """Voxels along an axis, the geometric mean of the three; 128 where the file can't be read here."""
         try:
-            file = volume_path(self.file)
-            size = describe(file).shape if self.frame is None else _time_series(file, self.frame).shape[:3]
-        except (ValueError, OSError, ImportError):
+            size = self._header().size
+        except (ValueError, OSError):
             return 128.0
-        return float(np.prod(np.asarray(size[-3:], dtype=np.float64)) ** (1 / 3))
+        return float(np.prod(np.asarray(size, dtype=np.float64)) ** (1 / 3))
 
     def load(self) -> fl.Volume:
         """The volume, with its geometry."""
-        file = volume_path(self.file)
-        if self.frame is None:
-            return load_volume(file)
-        series = _time_series(file, self.frame)
-        samples = np.asarray(series.dataobj[..., self.frame], dtype=np.float32)
-        return fl.Volume(torch.from_numpy(np.ascontiguousarray(samples.T)), affine=series.affine)
+        return load_volume(volume_path(self.file), frame=self.frame)
+
+    def _header(self) -> VolumeHeader:
+        return describe(volume_path(self.file), frame=self.frame)
 
 
-def _time_series(path: Path, frame: int) -> Any:
-    """The NIfTI time series in a file, as nibabel's image. Raises ValueError unless it has that frame."""
-    import nibabel
-    from nibabel.filebasedimages import ImageFileError
+def input_files(config: BaseModel) -> dict[str, str]:
+    """{resolved path: SHA-256 of the content} of every file that the volumes of a config are read from.
 
-    try:
-        series: Any = nibabel.load(path)  # type: ignore[attr-defined]
-    except ImageFileError as error:
-        raise ValueError(f"expected a NIfTI time series; {error}") from None
-    if len(series.shape) != 4 or not frame < series.shape[3]:
-        raise ValueError(f"expected a time series with a frame {frame}; got the shape {series.shape}")
-    return series
+    Raises:
+        ValueError, OSError: a file that is not there or can't be read.
+    """
+    files = {file for choice in _volume_choices(config) for file in files_of(volume_path(choice.file))}
+    return {str(file): _digest(file) for file in sorted(files)}
+
+
+def _volume_choices(value: Any) -> Iterator[VolumeChoice]:
+    """Every volume choice in a config, however deep."""
+    if isinstance(value, VolumeChoice):
+        yield value
+    elif isinstance(value, BaseModel):
+        for _, inner in value:
+            yield from _volume_choices(inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            yield from _volume_choices(inner)
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
 
 
 class ExperimentConfig(StrictModel):
@@ -265,8 +297,18 @@ def _packaged(package: str, inside: str) -> Path:
 
 
 def known_configs(folder: Path = CONFIGS) -> dict[str, Path]:
-    """The config files of the project, by name."""
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    """The config files of the project, by name.
+
+    Raises:
+        ConfigError: there are none, as in a copy of this package without its configs.
+    """
+    found = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    if not found:
+        message = (
+            "expected the config files of the project, *.yaml; found none (they come with a checkout of filterlab)"
+        )
+        raise ConfigError([Problem(str(folder), "", message)])
+    return found
 
 
 def config_path(name: str) -> Path:
@@ -300,13 +342,16 @@ def load_heading(path: Path) -> Heading:
 
 
 def check_device(name: str, path: str = "device") -> None:
-    """Raises ConfigError unless torch can compute on that device here."""
+    """Raises ConfigError unless torch can compute on that device here and give the result back (`meta` can't)."""
     try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigError([Problem(name, path, f"expected a device that torch has here, like cpu; {reason}")]) from None
+        float(torch.ones(1, device=torch.device(name)).sum())
+    except (RuntimeError, AssertionError, ImportError, ValueError) as error:
+        message = f"expected a device that torch can compute on here, like cpu; got {name!r} ({_first_line(error)})"
+        raise ConfigError([Problem(name, path, message)]) from None
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def number(value: float | torch.Tensor) -> float | None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from experiments import dvr_signal, dvr_volume, frequency_response, rms_error, texture_precision
-from experiments.config import ExperimentConfig
+from experiments.config import ExperimentConfig, check_device
 from experiments.runs import Record, Run, Unit
 
 PARTS: dict[str, Any] = {
@@ -22,15 +22,32 @@ Part = Annotated[
 
 
 class Config(ExperimentConfig):
-    """Sections, each the config of another experiment. Device, threads and seed of the sections are their own."""
+    """Sections, each the config of another experiment.
+
+    Seed and device hold for every section that does not set its own; threads hold for the whole run.
+    """
 
     experiment: Literal["demo"]
     sections: Annotated[list[Part], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _inherited(self) -> Config:
+        for i, part in enumerate(self.sections):
+            if part.threads is not None:
+                raise ValueError(f"expected threads for the whole run only; section {i} sets {part.threads}")
+        given = {"seed": self.seed, "device": self.device}
+        parts = [
+            part.model_copy(update={k: v for k, v in given.items() if k not in part.model_fields_set})
+            for part in self.sections
+        ]
+        object.__setattr__(self, "sections", parts)
+        return self
 
 
 def check(config: Config, path: str = "") -> None:
     """Raises ConfigError unless this machine has what every section needs."""
     for i, part in enumerate(config.sections):
+        check_device(part.device, f"{path}sections[{i}].device")
         part_check = getattr(PARTS[part.experiment], "check", None)
         if part_check is not None:
             part_check(part, f"{path}sections[{i}].")

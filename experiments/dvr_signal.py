@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 from torch import Tensor
 
+import filterlab as fl
 from experiments.config import BoundaryName, Dtype, ExperimentConfig, Recipe, Recipes, SignalChoice, number, torch_dtype
 from experiments.runs import Record, Run, Unit, timed
 from experiments.views import View
@@ -34,6 +35,12 @@ class Config(ExperimentConfig):
     dtype: Dtype = "float32"
 
 
+def check(config: Config, path: str = "") -> None:
+    """Raises ConfigError unless the images can be drawn and compared."""
+    config.signal.check(f"{path}signal")
+    config.view.check(_truth(config).domain, f"{path}view", compared=True)
+
+
 def units(config: Config) -> list[Unit]:
     """The image of the signal itself, then one per method."""
     cost = config.view.seconds(config.resolution)
@@ -46,16 +53,20 @@ def units(config: Config) -> list[Unit]:
 
 def compute(config: Config, unit: Unit, run: Run) -> Record:
     """The record of one image."""
-    signal = config.signal.build()
-    extent = max(b - a for a, b in zip(signal.domain.lower, signal.domain.upper, strict=True))
     if unit.key == TRUTH:
-        # the same step in world units as for the volumes, so that images differ by the reconstruction alone
-        field = signal.with_voxel_size(extent / config.resolution)
+        field = _truth(config)
         image, seconds = timed(lambda: config.view.draw(field, run, config.device, config.dtype))
         files = {"image": run.save_image(TRUTH, image), "array": run.save_array(TRUTH, image)}
         return {"kind": TRUTH, **files, "files": list(files.values()), "render_seconds": seconds}
     recipe = next(r for r in config.methods if r.key == unit.key)
     return {"kind": "method", **recipe.record(), **_image(config, recipe, run)}
+
+
+def _truth(config: Config) -> fl.Field:
+    """The signal, with the step in world units that the volumes have: images differ by the reconstruction alone."""
+    signal = config.signal.build()
+    extent = max(b - a for a, b in zip(signal.domain.lower, signal.domain.upper, strict=True))
+    return signal.with_voxel_size(extent / config.resolution)
 
 
 def _image(config: Config, recipe: Recipe, run: Run) -> Record:

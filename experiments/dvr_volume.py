@@ -50,8 +50,10 @@ class Config(ExperimentConfig):
 
 
 def check(config: Config, path: str = "") -> None:
-    """Raises ConfigError unless the volume file is there and sound."""
-    config.volume.check(f"{path}volume")
+    """Raises ConfigError unless the volume file is there and sound, and its images can be drawn."""
+    domain = config.volume.check(f"{path}volume")
+    for window in config.windows.values():
+        config.view.through(window).check(domain, f"{path}view")
 
 
 def units(config: Config) -> list[Unit]:

@@ -43,7 +43,8 @@ class Config(ExperimentConfig):
     def _measured(self) -> Config:
         measured = {recipe.key for recipe in self.methods}
         for recipe in self.methods:
-            if recipe.sampler != "exact" or recipe.gradient is not None:
+            needless = recipe.gradient is not None and recipe.scheme == "direct"
+            if recipe.sampler != "exact" or needless:
                 raise ValueError(f"{recipe.key}: a response belongs to the value; leave gradient and sampler out")
         for figure in self.figures:
             for recipe in figure.methods:

@@ -35,7 +35,7 @@ class Experiment:
         compute: (config, unit, run) -> the record of that unit; may read records of earlier units from the run.
         draw: (config, records by key, run folder) -> a section of the report; computes nothing.
         check: (config, path of the config's keys) -> None; raises ConfigError where this machine lacks what the config
-            needs (a volume file).
+            needs (a volume file), or where the work would fail for a reason that can be seen beforehand.
     """
 
     name: str

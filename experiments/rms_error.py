@@ -74,6 +74,12 @@ class Config(ExperimentConfig):
     dtype: Dtype = "float64"
 
 
+def check(config: Config, path: str = "") -> None:
+    """Raises ConfigError unless the signals can be evaluated."""
+    for i, study in enumerate(config.studies):
+        study.signal.check(f"{path}studies[{i}].signal")
+
+
 def units(config: Config) -> list[Unit]:
     """One per study, resolution and method, then one fit per study and method."""
     work = []

@@ -1,9 +1,9 @@
 """Run folders: what was asked for, by what it was computed, and what came out. An interrupted run loses nothing.
 
-runs/<config name>-<hash of the resolved config>[-2, -3, … with --fresh]/
+runs/<config name>-<hash of the resolved config and of the input files>[-2, -3, … with --fresh]/
     config.yaml        the resolved config
-    provenance.jsonl   one line per start: versions, commit, device, threads, seed
-    records.jsonl      one line per finished unit of work, flushed to disk before the next begins
+    provenance.jsonl   one line per start: its number, versions, commit, device, threads, seed, input files by content
+    records.jsonl      one line per finished unit of work, flushed to disk before the next begins; `start` made it
     files/             images and arrays that records name
     report.html        what `experiments report` draws from the above
 """
@@ -36,6 +36,7 @@ from filterlab.io.config import dump_config
 
 Record = dict[str, Any]
 T = TypeVar("T")
+CODE = ("filterlab", "commit")  # of a start: by which code its records were computed
 
 
 class RunError(ValueError):
@@ -62,15 +63,23 @@ def resolved(config: BaseModel) -> dict[str, Any]:
     return config.model_dump(mode="json")
 
 
-def config_hash(config: BaseModel) -> str:
-    """Ten hexadecimal digits that change with any value of the resolved config."""
-    canonical = json.dumps(resolved(config), sort_keys=True, ensure_ascii=False)
+def config_hash(config: BaseModel, inputs: Mapping[str, str] | None = None) -> str:
+    """Ten hexadecimal digits that change with any value of the resolved config, and with any input file.
+
+    `inputs` is {path: digest of the content}, as `experiments.config.input_files` gives it.
+    """
+    canonical = json.dumps([resolved(config), dict(inputs or {})], sort_keys=True, ensure_ascii=False)
     return hashlib.sha256(canonical.encode()).hexdigest()[:10]
 
 
-def run_folder(root: Path, name: str, config: BaseModel, *, fresh: bool = False) -> Path:
-    """The folder of the latest run of that config below `root`, or with `fresh` the next one that does not exist."""
-    stem = f"{name}-{config_hash(config)}"
+def run_folder(
+    root: Path, name: str, config: BaseModel, inputs: Mapping[str, str] | None = None, *, fresh: bool = False
+) -> Path:
+    """The folder of the latest run of that config on those input files below `root`.
+
+    With `fresh`, the next one that does not exist.
+    """
+    stem = f"{name}-{config_hash(config, inputs)}"
     k = 1
     while _numbered(root, stem, k).exists():
         k += 1
@@ -94,15 +103,20 @@ class Run:
         self.folder = folder
         self.prefix = prefix
         self._records = records
-        self._shared = shared or _Shared()
+        self._shared = shared or _Shared([{"start": 1}])
 
     @classmethod
     @contextmanager
     def open(cls, folder: Path, config: BaseModel, provenance: Mapping[str, Any]) -> Iterator[Run]:
         """The folder, created or resumed, and locked against a second process.
 
+        Args:
+            folder: what `run_folder` gives.
+            config: the resolved config.
+            provenance: of this start; it is written down with its number.
+
         Raises:
-            RunError: it can't be created or written, holds another config, or is in use.
+            RunError: it can't be created or written, holds another config or other input files, or is in use.
         """
         try:
             (folder / "files").mkdir(parents=True, exist_ok=True)
@@ -112,9 +126,8 @@ class Run:
         with lock:
             _lock(lock, folder)
             _write_config(folder, config)
-            with (folder / "provenance.jsonl").open("a") as file:
-                _append_line(file.fileno(), provenance)
-            yield cls(folder, repaired_records(folder))
+            starts = _begin(folder, provenance)
+            yield cls(folder, repaired_records(folder), shared=_Shared(starts))
 
     def section(self, name: str) -> Run:
         """The same run, with every key and file under `name/`."""
@@ -134,9 +147,22 @@ class Run:
         record = self._records.get(self.prefix + key)
         return record is not None and all((self.folder / f).is_file() for f in record.get("files", []))
 
+    @property
+    def start(self) -> Record:
+        """The provenance of this start."""
+        return self._shared.starts[-1]
+
+    def made_by_other_code(self) -> list[Record]:
+        """The earlier starts that records here were made by, as far as filterlab's version or commit was another."""
+        now, earlier = self.start, self._shared.starts[:-1]
+        if not earlier:
+            return []
+        makers = {record.get("start", earlier[-1]["start"]) for record in self._records.values()}
+        return [s for s in earlier if s["start"] in makers and any(s.get(k) != now.get(k) for k in CODE)]
+
     def append(self, key: str, record: Mapping[str, Any]) -> Record:
-        """Writes the record of a finished unit; when this returns it is on the disk."""
-        full = {"key": self.prefix + key, **record}
+        """Writes the record of a finished unit, with the number of this start; then it is on the disk."""
+        full = {"key": self.prefix + key, "start": self.start["start"], **record}
         descriptor = os.open(self.folder / "records.jsonl", os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
         try:
             _append_line(descriptor, full)
@@ -194,6 +220,7 @@ class Run:
 class _Shared:
     """What the sections of one run have in common."""
 
+    starts: list[Record]  # all so far, the current one last
     memory: dict[str, tuple[str, Any]] = field(default_factory=dict)
     on_advance: Callable[[float], None] = lambda _fraction: None
 
@@ -214,6 +241,21 @@ def _write_config(folder: Path, config: BaseModel) -> None:
         return
     with atomic_write(path) as temporary:
         temporary.write_text(text)
+
+
+def _begin(folder: Path, provenance: Mapping[str, Any]) -> list[Record]:
+    """Writes this start down and returns all. Raises RunError if earlier ones had other input files."""
+    starts = read_provenance(folder)
+    path, inputs = folder / "provenance.jsonl", provenance.get("inputs", {})
+    if starts and starts[-1].get("inputs", {}) != inputs:
+        raise RunError(f"{path} tells of other input files than those that are there now; use --fresh for a new folder")
+    start = {"start": len(starts) + 1, **provenance}
+    with path.open("ab") as file:
+        if path.stat().st_size and not path.read_bytes().endswith(b"\n"):
+            file.write(b"\n")  # a line that was torn by a kill stays alone
+            file.flush()
+        _append_line(file.fileno(), start)
+    return [*starts, start]
 
 
 def _append_line(descriptor: int, record: Mapping[str, Any]) -> None:
@@ -269,21 +311,23 @@ def repaired_records(folder: Path) -> dict[str, Record]:
 
 
 def read_provenance(folder: Path) -> list[Record]:
-    """One entry per start of the run."""
+    """One entry per start of the run, each with its number."""
     path = folder / "provenance.jsonl"
     if not path.exists():
         return []
     entries = []
     for line in path.read_text().splitlines():
         try:
-            entries.append(json.loads(line))
+            entry = json.loads(line)
         except ValueError:
             continue  # torn by a kill at the very start; the next start wrote its own
+        if isinstance(entry, dict):
+            entries.append({"start": len(entries) + 1, **entry})
     return entries
 
 
-def provenance(device: str, seed: int, command: str) -> Record:
-    """What a later reader needs to know about this start of a run."""
+def provenance(device: str, seed: int, command: str, inputs: Mapping[str, str] | None = None) -> Record:
+    """What a later reader needs to know about this start of a run; `inputs` is {path: digest} of the files it reads."""
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
@@ -296,6 +340,7 @@ def provenance(device: str, seed: int, command: str) -> Record:
         "device": _device_name(device),
         "threads": torch.get_num_threads(),
         "seed": seed,
+        "inputs": dict(inputs or {}),
     }
 
 
@@ -311,13 +356,17 @@ def _device_name(device: str) -> str:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout, with `+changes` when files differ from it; None outside a checkout."""
+    """The commit of the checkout, with `+changes` and a digest of them when files differ; None outside a checkout."""
     here = Path(__file__).resolve().parent
     try:
         ask = lambda *words: subprocess.run(  # noqa: E731
             ["git", "-C", str(here), *words], capture_output=True, text=True, timeout=10, check=True
         ).stdout.strip()
-        return ask("rev-parse", "--short=12", "HEAD") + ("+changes" if ask("status", "--porcelain") else "")
+        commit, status = ask("rev-parse", "--short=12", "HEAD"), ask("status", "--porcelain")
+        if not status:
+            return commit
+        changes = hashlib.sha256(f"{status}\n{ask('diff', 'HEAD')}".encode()).hexdigest()
+        return f"{commit}+changes.{changes[:8]}"
     except (OSError, subprocess.SubprocessError):
         return None
 

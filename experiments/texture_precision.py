@@ -14,20 +14,22 @@ Errors of the value are relative to the range of the samples; errors of the grad
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
 import filterlab as fl
 from experiments.config import (
     BoundaryName,
     ExperimentConfig,
-    MethodName,
     Recipe,
+    Recipes,
     SignalChoice,
     VolumeChoice,
+    distinct,
     number,
 )
 from experiments.dvr_signal import amplified_difference, image_errors
@@ -35,6 +37,7 @@ from experiments.rms_error import evaluate, uniform_points
 from experiments.runs import Record, Run, RunError, Unit
 from experiments.views import View
 from filterlab import metrics
+from filterlab.fields.base import Domain
 from filterlab.io.config import StrictModel
 
 VARIANTS: dict[str, tuple[torch.dtype, str, str]] = {
@@ -67,6 +70,16 @@ class Source(StrictModel):
         """Voxels along an axis."""
         return self.volume.extent() if self.volume is not None else float(self.resolution or 1)
 
+    def check(self, path: str) -> Domain:
+        """The domain of the samples. Raises ConfigError, for the key at `path`, unless a volume file is sound."""
+        if self.volume is not None:
+            return self.volume.check(f"{path}.volume")
+        assert self.signal is not None
+        assert self.resolution is not None
+        domain = self.signal.check(f"{path}.signal").domain
+        extent = max(b - a for a, b in zip(domain.lower, domain.upper, strict=True))
+        return replace(domain, voxel_size=extent / self.resolution)
+
     def load(self, device: str) -> fl.Volume:
         """The samples, float64."""
         if self.signal is not None and self.resolution is not None:
@@ -78,13 +91,14 @@ class Source(StrictModel):
 class Config(ExperimentConfig):
     """Precision of the eight-trilinear scheme, for some methods and sources.
 
-    Points are drawn from the box shrunk to `inner`, so that the ends of a signal do not hide its reconstruction.
+    Points are drawn from the box shrunk to `inner`, so that the ends of a signal do not hide its reconstruction. A
+    recipe has the kind of gradient that the scheme gives: trilinear says `gradient: central`.
     """
 
     experiment: Literal["texture_precision"]
     sources: Annotated[list[Source], Field(min_length=1)]
-    methods: Annotated[list[MethodName], Field(min_length=1)]
-    image_methods: list[MethodName] = Field(default_factory=list)
+    methods: Recipes
+    image_methods: Annotated[list[Recipe], AfterValidator(distinct)] = Field(default_factory=list)
     boundary: BoundaryName = "mirror"
     points: Annotated[int, Field(ge=10, le=10**8)] = 50_000
     inner: Annotated[float, Field(gt=0, le=1)] = 0.8
@@ -92,20 +106,22 @@ class Config(ExperimentConfig):
 
     @model_validator(mode="after")
     def _sampled(self) -> Config:
-        for name in [*self.methods, *self.image_methods]:
-            if "eight_trilinear" not in fl.METHODS[name].facts.schemes:
+        for recipe in [*self.methods, *self.image_methods]:
+            if (recipe.scheme, recipe.sampler) != ("direct", "exact"):
+                raise ValueError(f"{recipe.key}: every scheme and sampler is measured; leave them out")
+            if "eight_trilinear" not in fl.METHODS[recipe.method].facts.schemes:
                 offering = [m for m, method in fl.METHODS.items() if "eight_trilinear" in method.facts.schemes]
-                raise ValueError(f"{name} offers no scheme eight_trilinear; {', '.join(offering)} do")
-        if any(len(set(names)) < len(names) for names in (self.methods, self.image_methods)):
-            raise ValueError("expected every method once")
+                raise ValueError(f"{recipe.method} offers no scheme eight_trilinear; {', '.join(offering)} do")
+            _variant(recipe, "eight_trilinear", "exact")
         return self
 
 
 def check(config: Config, path: str = "") -> None:
-    """Raises ConfigError unless the volume files are there and sound."""
+    """Raises ConfigError unless the volume files are there and sound, and their images can be drawn."""
     for i, source in enumerate(config.sources):
-        if source.volume is not None:
-            source.volume.check(f"{path}sources[{i}].volume")
+        domain = source.check(f"{path}sources[{i}]")
+        if source.view is not None and config.image_methods:
+            source.view.check(domain, f"{path}sources[{i}].view", compared=True)
 
 
 def units(config: Config) -> list[Unit]:
@@ -113,33 +129,35 @@ def units(config: Config) -> list[Unit]:
     work = []
     for i, source in enumerate(config.sources):
         seconds = 0.5 + config.points * 1e-4
-        work += [Unit(f"{i}/points/{name}", f"{source.title}, {name}", seconds) for name in config.methods]
+        work += [Unit(f"{i}/points/{r.key}", f"{source.title}, {r.key}", seconds) for r in config.methods]
         if source.view is not None:
             seconds = 2 * source.view.seconds(source.extent())
             work += [
-                Unit(f"{i}/image/{name}", f"{source.title}, {name}: images", seconds) for name in config.image_methods
+                Unit(f"{i}/image/{r.key}", f"{source.title}, {r.key}: images", seconds) for r in config.image_methods
             ]
     return work
 
 
 def compute(config: Config, unit: Unit, run: Run) -> Record:
     """The record of one unit."""
-    index, what, name = unit.key.split("/")
+    index, what, key = unit.key.split("/")
     source = config.sources[int(index)]
+    recipe = next(r for r in (config.methods if what == "points" else config.image_methods) if r.key == key)
     volume = run.memo(f"volume:{index}", lambda: source.load(config.device))
-    common = {"source": int(index), "kind": what, **_recipe(name, "eight_trilinear", "exact").record()}
+    common = {"source": int(index), "kind": what, **_variant(recipe, "eight_trilinear", "exact").record()}
     if what == "points":
-        return {**common, **_precision(config, source, volume, name)}
-    return {**common, **_images(config, source, volume, name, run)}
+        return {**common, **_precision(config, source, volume, recipe)}
+    return {**common, **_images(config, source, volume, recipe, run)}
 
 
-def _recipe(method: str, scheme: Any, sampler: Any) -> Recipe:
-    """The recipe with the kind of gradient that the sampled scheme has, whatever the scheme."""
-    return Recipe(method=method, gradient=fl.METHODS[method].sampled_gradient, scheme=scheme, sampler=sampler)  # type: ignore[arg-type]
+def _variant(recipe: Recipe, scheme: Any, sampler: Any) -> Recipe:
+    """The recipe with another scheme. Raises ValueError for a kind of gradient that the scheme does not give."""
+    fl.METHODS[recipe.method].scheme(scheme, recipe.gradient, sampler)
+    return recipe.model_copy(update={"scheme": scheme, "sampler": sampler})
 
 
-def _precision(config: Config, source: Source, volume: fl.Volume, name: str) -> Record:
-    reference = _recipe(name, "direct", "exact").reconstruct(volume, config.boundary)
+def _precision(config: Config, source: Source, volume: fl.Volume, recipe: Recipe) -> Record:
+    reference = recipe.reconstruct(volume, config.boundary)
     # points that float32 holds exactly, so that every variant is asked at the same ones
     points = uniform_points(reference, config.points, config.inner, config.seed, torch.float32, config.device).double()
     value, gradient = evaluate(reference, points)
@@ -149,7 +167,7 @@ def _precision(config: Config, source: Source, volume: fl.Volume, name: str) -> 
         raise RunError(f"{source.title}: expected samples that vary; all are {float(volume.samples.max())}")
     variants = {}
     for variant, (dtype, scheme, sampler) in VARIANTS.items():
-        field = _recipe(name, scheme, sampler).reconstruct(volume.to(dtype), config.boundary)
+        field = _variant(recipe, scheme, sampler).reconstruct(volume.to(dtype), config.boundary)
         v, g = (t.double() for t in evaluate(field, points.to(dtype)))
         variants[variant] = _errors(v, value, scale) | _gradient_errors(g, gradient, length)
     record: Record = {"variants": variants, "range": scale, "gradient_length": length, "points": config.points}
@@ -178,15 +196,15 @@ def _gradient_errors(gradient: Tensor, reference: Tensor, length: float) -> Reco
     }
 
 
-def _images(config: Config, source: Source, volume: fl.Volume, name: str, run: Run) -> Record:
+def _images(config: Config, source: Source, volume: fl.Volume, recipe: Recipe, run: Run) -> Record:
     assert source.view is not None
     single = volume.to(torch.float32)
     fields = [
-        _recipe(name, "eight_trilinear", sampler).reconstruct(single, config.boundary)
+        _variant(recipe, "eight_trilinear", sampler).reconstruct(single, config.boundary)
         for sampler in ("exact", "texture_unit")
     ]
     exact, rounded = (source.view.draw(field, run, config.device, "float32") for field in fields)
-    stem = f"{config.sources.index(source)}-{name}"
+    stem = f"{config.sources.index(source)}-{recipe.key}"
     files = {
         "exact": run.save_image(f"{stem}-exact", exact),
         "rounded": run.save_image(f"{stem}-rounded", rounded),

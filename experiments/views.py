@@ -11,11 +11,16 @@ from torch import Tensor
 import filterlab as fl
 from experiments.config import Dtype, torch_dtype
 from experiments.runs import Run
-from filterlab.io.config import StrictModel
+from filterlab.fields.base import Domain
+from filterlab.io.config import ConfigError, Problem, StrictModel
 from filterlab.render import scene
 from filterlab.render.dvr import render
+from filterlab.render.rays import intersect, segment_count
 
 SECONDS_PER_SAMPLE = 3e-7  # of plain torch on two cores, for views that are mostly empty; only expectations use it
+MAX_SAMPLES = 2**34  # of an image: hours of work
+SSIM_WINDOW = 11  # pixels
+_PROBE = 96  # pixels along the longer side, by which the samples of an image are estimated
 
 
 def _part(window: list[float]) -> list[float]:
@@ -63,6 +68,36 @@ class View(StrictModel):
         inner = (left + window[0] * width, top + window[1] * height, left + window[2] * width, top + window[3] * height)
         return self.model_copy(update={"camera": self.camera.model_copy(update={"window": inner})})
 
+    def check(self, domain: Domain, path: str, *, compared: bool = False) -> None:
+        """Raises ConfigError, for the key of the view at `path`, where an image of a field there can't be drawn.
+
+        That is: a camera that does not go with the domain, or more samples than `MAX_SAMPLES` (estimated with few
+        rays); for images that are `compared`, too few pixels for SSIM.
+        """
+        if compared and min(self.size) < SSIM_WINDOW:
+            message = f"expected at least {SSIM_WINDOW} pixels each way, the window of SSIM; got {self.size}"
+            raise ConfigError([Problem("the view", f"{path}.size", message)])
+        try:
+            samples = self._samples(domain)
+        except ValueError as error:
+            raise ConfigError([Problem("the view", path, str(error))]) from None
+        if not samples <= MAX_SAMPLES:
+            message = (
+                f"expected an image of at most {MAX_SAMPLES:.2g} samples; got about {samples:.2g} with step "
+                f"{self.step:g} and size {list(self.size)}: use a longer step, or a smaller image or region"
+            )
+            raise ConfigError([Problem("the view", f"{path}.step", message)])
+
+    def _samples(self, domain: Domain) -> float:
+        """How many samples an image takes, about: those of the rays of a smaller one, times its share of the pixels."""
+        scale = min(1.0, _PROBE / max(self.size))
+        width, height = (max(round(scale * n), 1) for n in self.size)
+        camera = self.camera.build(domain, self.size)
+        origins, directions = camera.pixel_rays(torch.arange(width * height), width, height)
+        near, far = intersect(origins, directions, domain, self.region.build() if self.region else None)
+        count = segment_count((far - near).clamp_min(0), self.step * domain.voxel_size).sum()
+        return float(count) * (self.size[0] * self.size[1]) / (width * height)
+
     def seconds(self, voxels: float) -> float:
         """A rough expectation for an image of a volume with that many voxels along an axis."""
         width, height = self.size
@@ -81,6 +116,7 @@ class View(StrictModel):
                 background=self.background,
                 region=self.region.build() if self.region else None,
                 termination=self.termination,
+                max_samples=MAX_SAMPLES,
                 dtype=torch_dtype(dtype),
                 device=device,
                 progress=lambda done, total: run.advance(done / max(total, 1)),

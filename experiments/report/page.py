@@ -116,6 +116,7 @@ def render(
         duration=_duration(seconds),
         config_text=config_text,
         provenance=_provenance_table(starts),
+        inputs=_inputs_table(starts),
         started=starts[0]["started"].partition("T")[0] if starts else "",
         colors=themed_colors(),
     )
@@ -126,8 +127,18 @@ def _duration(seconds: float) -> str:
 
 
 def _provenance_table(starts: Sequence[Mapping[str, Any]]) -> Table:
-    """Starts with the same provenance as one row, newest last."""
-    names = ("filterlab", "commit", "torch", "numpy", "python", "system", "device", "threads", "seed")
-    columns = [Column("started", numeric=False), *(Column(name, numeric=False) for name in names)]
-    rows = [[str(s.get(name) or "–") if s.get(name) != 0 else "0" for name in ("started", *names)] for s in starts]
+    """One row for each start, newest last; records name theirs."""
+    versions = ("filterlab", "commit", "torch", "numpy", "python", "system")
+    names = ("start", "started", *versions, "device", "threads", "seed")
+    columns = [Column(name, numeric=False) for name in names]
+    rows = [[str(s.get(name) or "–") if s.get(name) != 0 else "0" for name in names] for s in starts]
     return Table(columns, rows, "By what the records were computed: one row for each start of the run.")
+
+
+def _inputs_table(starts: Sequence[Mapping[str, Any]]) -> Table | None:
+    """The files that volumes were read from, the same for every start; None where there are none."""
+    inputs = starts[-1].get("inputs") if starts else None
+    if not inputs:
+        return None
+    columns = [Column("file", numeric=False), Column("SHA-256", numeric=False)]
+    return Table(columns, [[path, digest] for path, digest in inputs.items()], "From what volumes were read.")

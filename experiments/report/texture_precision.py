@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from experiments.report import plots
 from experiments.report.page import Block, Column, Gallery, Plot, Section, Table, picture
-from experiments.report.style import MISSING, fixed, look, text
+from experiments.report.style import MISSING, fixed, label, look, text
 from experiments.runs import Record
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section
     """The section of the report."""
     parts = []
     for index, source in enumerate(config.sources):
-        points = [records[f"{index}/points/{m}"] for m in config.methods if f"{index}/points/{m}" in records]
-        images = [records[f"{index}/image/{m}"] for m in config.image_methods if f"{index}/image/{m}" in records]
+        points = [records[k] for k in (f"{index}/points/{r.key}" for r in config.methods) if k in records]
+        images = [records[k] for k in (f"{index}/image/{r.key}" for r in config.image_methods) if k in records]
         blocks: list[Block] = []
         if points:
             blocks += [_plot(index, points), _numbers(points, config.inner)]
@@ -78,7 +78,7 @@ def _panel(axes: Axes, records: Sequence[Record], quantity: str, title: str) -> 
         own = record.get("method_error")
         if own and own[quantity]:
             axes.plot([own[quantity]] * 2, [row - 0.32, row + 0.32], color=color, linewidth=2.5)
-    axes.set_yticks(range(len(records)), [r["method"] for r in records])
+    axes.set_yticks(range(len(records)), [label(r, gradient=False) for r in records])
     axes.set_ylim(len(records) - 0.5, -0.5)
     plots.logarithmic_x(axes)
     axes.set_title(title)
@@ -102,7 +102,7 @@ def _numbers(records: Sequence[Record], inner: float) -> Table:
             entries["the reconstruction itself"] = record["method_error"]
         for i, (name, r) in enumerate(entries.items()):
             keys = ("value_rms", "value_max", "gradient_rms", "gradient_max", "angle_mean", "angle_max")
-            rows.append([record["method"] if i == 0 else "", name, *(text(r[k], 2) for k in keys)])
+            rows.append([label(record, gradient=False) if i == 0 else "", name, *(text(r[k], 2) for k in keys)])
     caption = (
         f"Against the direct sum in float64, at {records[0]['points']:,} uniform points of the box shrunk to "
         f"{inner:g}. Angles where the gradient is longer than 1 % of the longest. “The reconstruction itself”: "
@@ -114,10 +114,11 @@ def _numbers(records: Sequence[Record], inner: float) -> Table:
 def _pairs(config: Config, records: Sequence[Record], folder: Path) -> Gallery:
     pictures = []
     for r in records:
+        name = label(r, gradient=False)
         psnr = MISSING if r["psnr"] is None else f"{fixed(r['psnr'], 1)} dB"
         pictures += [
-            picture(folder, r["exact"], f"{r['method']}, exact fractions", "float32"),
-            picture(folder, r["rounded"], f"{r['method']}, 8-bit fractions", f"{psnr}, largest {text(r['max'], 2)}"),
+            picture(folder, r["exact"], f"{name}, exact fractions", "float32"),
+            picture(folder, r["rounded"], f"{name}, 8-bit fractions", f"{psnr}, largest {text(r['max'], 2)}"),
             picture(folder, r["difference"], "difference", f"amplified {config.amplify:g} times"),
         ]
     caption = (

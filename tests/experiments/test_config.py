@@ -6,7 +6,7 @@ import filterlab as fl
 from experiments.__main__ import main, split_overrides
 from experiments.config import Recipe, known_configs, volume_path
 from experiments.registry import EXPERIMENTS, experiment_of, load
-from filterlab.io.config import ConfigError
+from filterlab.io.config import ConfigError, dump_config, loads_config
 
 
 def refused(path, overrides=None):
@@ -51,6 +51,16 @@ def test_every_experiment_has_a_config():
         ({"methods.0": "{method: mitchell, scheme: eight_trilinear}"}, "methods[0]", ["direct"]),
         ({"methods.0": "{method: notch, sampler: texture_unit}"}, "methods[0]", ["eight_trilinear"]),
         ({"device": "abacus"}, "device", ["cpu"]),
+        ({"device": "meta"}, "device", ["cpu", "'meta'"]),
+        ({"studies.0.signal": "{name: sphere, parameters: {radius: [.1, .2, .3]}}"}, "studies[0].signal", ["a number"]),
+        ({"studies.0.signal": "{name: gaussian, parameters: {center: 1}}"}, "studies[0].signal", ["three numbers"]),
+        (
+            {"studies.0.signal": "{name: plane-wave, parameters: {wave_vector: [1, 2]}}"},
+            "studies[0].signal",
+            ["[1.0, 2.0]"],
+        ),
+        ({"studies.0.signal": "{name: gaussian, parameters: {sigma: 0}}"}, "studies[0].signal", ["sigma"]),
+        ({"studies.0.signal": "{name: gaussian, parameters: {sigma: 1e-200}}"}, "studies[0].signal", ["finite"]),
         ({"experiment": "dvr_signal"}, "experiment", ["rms_error"]),
     ],
 )
@@ -91,9 +101,66 @@ def test_an_override_needs_one_value(words, capsys):
 
 def test_a_recipe_knows_its_defaults():
     assert Recipe.model_validate("ncrsi").gradient_kind == "central"
-    assert Recipe(method="trilinear", scheme="eight_trilinear").gradient_kind == "central"
     assert Recipe(method="triquadratic").declared_order == 3
     assert Recipe(method="triquadratic", prefilter=False).declared_order == 2
+
+
+def test_the_sampled_scheme_says_which_gradient_it_gives():
+    with pytest.raises(ValueError, match="central"):
+        Recipe(method="trilinear", scheme="eight_trilinear")
+    sampled = Recipe(method="trilinear", gradient="central", scheme="eight_trilinear")
+    assert (sampled.gradient_kind, Recipe(method="ncrsi", scheme="eight_trilinear").gradient_kind) == ("central",) * 2
+    for name, key in (
+        ("texture_precision", "methods"),
+        ("texture_precision", "image_methods"),
+        ("demo", "sections.4.methods"),
+    ):
+        with pytest.raises(ConfigError, match="gradient='central'"):
+            load(name, {key: "[trilinear]"})
+    with pytest.raises(ConfigError, match="leave them out"):
+        load("texture_precision", {"methods": "[{method: notch, scheme: eight_trilinear}]"})
+
+
+def test_seed_and_device_hold_for_sections_without_their_own():
+    _, _, config = load("demo", {"seed": "7", "sections.3.seed": "0"})
+    assert [part.seed for part in config.sections] == [7, 7, 7, 0, 7]
+    again = loads_config(dump_config(config), type(config))
+    assert again == config
+    assert dump_config(again) == dump_config(config)
+    sections = loads_config(dump_config(config), type(config), {"device": "meta"}).sections
+    assert {part.device for part in sections} == {"cpu"}  # written out: their own
+
+
+def test_the_device_reaches_every_section():
+    text = "experiment: demo\ndescription: d\ndevice: meta\nsections:\n"
+    section = "  - {experiment: frequency_response, description: d, methods: [notch]%s}\n"
+    demo = loads_config(text + section % "" + section % ", device: cpu", EXPERIMENTS["demo"].config)
+    assert [part.device for part in demo.sections] == ["meta", "cpu"]
+
+
+@pytest.mark.parametrize("device", ["meta", "cuda:97", "abacus"])
+def test_the_device_of_every_section_is_checked(device, tmp_path, capsys):
+    runs = tmp_path / "runs"
+    assert main(["run", "demo", "--sections.2.device", device, "--runs", str(runs)]) == 2
+    message = capsys.readouterr().err
+    assert "sections[2].device: expected a device that torch can compute on here" in message
+    assert len(message.splitlines()) == 1
+    assert not runs.exists()
+
+
+def test_threads_are_for_the_whole_run():
+    with pytest.raises(ConfigError, match="section 1 sets 3"):
+        load("demo", {"sections.1.threads": "3"})
+
+
+def test_without_configs_the_command_says_where_it_looked(tmp_path, monkeypatch, capsys, tiny_rms):
+    monkeypatch.setattr(known_configs, "__defaults__", (tmp_path / "gone",))
+    for words in (["list"], ["run", "demo"]):
+        assert main(words) == 2
+        out, err = capsys.readouterr()
+        assert not out
+        assert str(tmp_path / "gone") in err
+    assert load(str(tiny_rms))[0] == "tiny"  # a file by its path needs none
 
 
 def test_volume_files_are_found_by_name(tmp_path, monkeypatch):

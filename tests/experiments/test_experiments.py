@@ -1,8 +1,12 @@
 """Every experiment on tiny parameters: its records, its report, and what it must show."""
 
+import hashlib
 import json
 import math
+import re
+import struct
 
+import nibabel
 import numpy as np
 import pytest
 import torch
@@ -11,10 +15,10 @@ import yaml
 import filterlab as fl
 from experiments import rms_error
 from experiments.__main__ import main
-from experiments.config import known_configs
+from experiments.config import VolumeChoice, input_files, known_configs
 from experiments.dvr_signal import amplified_difference, displayed, image_errors
 from experiments.registry import EXPERIMENTS, load
-from experiments.runs import read_records
+from experiments.runs import read_provenance, read_records
 from experiments.views import View
 
 VIEW = {
@@ -65,7 +69,7 @@ def tiny(name, scan):
             "zooms": [{"title": "the middle", "window": [0.25, 0.25, 0.75, 0.75]}],
         },
         "texture_precision": {
-            "methods": ["trilinear", "triquadratic"],
+            "methods": [{"method": "trilinear", "gradient": "central"}, "triquadratic"],
             "image_methods": ["triquadratic"],
             "sources": [
                 {"title": "signal", "signal": "gaussian", "resolution": 12, "view": VIEW},
@@ -209,14 +213,14 @@ def test_a_zoom_is_a_magnified_part(scan):
 
 def test_rounded_fractions_cost_more_than_float32(ran):
     _, records, _ = ran("texture_precision")
-    for key in ("0/points/triquadratic", "1/points/trilinear"):
+    for key in ("0/points/triquadratic", "1/points/trilinear+central"):
         variants = records[key]["variants"]
         assert variants["float64 eight samples"]["value_rms"] < 1e-14
         assert variants["float32 direct"]["value_rms"] < 1e-6
         for quantity in ("value_rms", "gradient_rms"):
             assert variants["float32 8-bit fractions"][quantity] > 30 * variants["float32 eight samples"][quantity]
-    assert "method_error" in records["0/points/trilinear"]
-    assert "method_error" not in records["1/points/trilinear"]
+    assert "method_error" in records["0/points/trilinear+central"]
+    assert "method_error" not in records["1/points/trilinear+central"]
     assert records["0/image/triquadratic"]["psnr"] > 30
 
 
@@ -236,6 +240,166 @@ def test_the_demo_gives_what_its_parts_give(ran, tmp_path):
     for key, record in read_records(single)[0].items():
         if record["kind"] == "error":
             assert own[f"0/{key}"] == record["value_rms"]
+
+
+@pytest.mark.parametrize("kind", ["attached", "detached", "moved"])
+def test_another_volume_of_the_same_name_is_another_run(kind, tmp_path, monkeypatch, capsys):
+    """The file is found by a bare name; its content changes, or the folder that it is found in."""
+    views = []
+    config = tiny("dvr_volume", "scan.nhdr" if kind == "detached" else "scan.nrrd")
+    config["methods"], config["zooms"] = ["triquadratic"], []
+    path = tmp_path / "dvr.yaml"
+    path.write_text(yaml.safe_dump(config))
+    for i, peak in enumerate((100, 150)):
+        folder = tmp_path / (f"volumes{i}" if kind == "moved" else "volumes")
+        folder.mkdir(exist_ok=True)
+        monkeypatch.setenv("FILTERLAB_VOLUMES", str(folder))
+        samples = torch.full((6, 6, 6), peak if kind != "moved" else 100, dtype=torch.uint8)
+        if kind == "detached":
+            (folder / "scan.raw").write_bytes(samples.numpy().tobytes())
+            header = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 6 6 6\nencoding: raw\ndata file: scan.raw\n"
+            (folder / "scan.nhdr").write_text(header)
+            inputs = [folder / "scan.nhdr", folder / "scan.raw"]
+        else:
+            fl.io.save_volume(fl.Volume(samples), folder / "scan.nrrd")
+            inputs = [folder / "scan.nrrd"]
+        for _ in range(2):
+            assert main(["run", str(path), "--runs", str(tmp_path / "runs")]) == 0
+        assert "done already" in capsys.readouterr().err
+        (run,) = set((tmp_path / "runs").iterdir()) - set(views)
+        views.append(run)
+        expected = {str(file.resolve()): hashlib.sha256(file.read_bytes()).hexdigest() for file in inputs}
+        assert [start["inputs"] for start in read_provenance(run)] == [expected] * 2
+        assert all(word in (run / "report.html").read_text() for item in expected.items() for word in item)
+    images = [next((run / "files").glob("*.png")).read_bytes() for run in views]
+    assert (images[0] == images[1]) == (kind == "moved")
+
+
+def test_the_volumes_of_sections_are_inputs(scan):
+    config = EXPERIMENTS["demo"].config.model_validate(tiny("demo", scan))
+    assert input_files(config) == {str(scan): hashlib.sha256(scan.read_bytes()).hexdigest()}
+
+
+def series_of(folder, frames=3):
+    samples = np.random.default_rng(0).integers(0, 255, (4, 5, 6, frames)).astype(np.uint8)
+    nibabel.save(nibabel.Nifti1Image(samples, np.diag([1.0, 2.0, 3.0, 1.0])), folder / "series.nii")
+    return folder / "series.nii", samples
+
+
+def test_a_frame_of_a_time_series_is_that_volume(tmp_path):
+    path, samples = series_of(tmp_path)
+    choice = VolumeChoice(file=str(path), frame=2)
+    assert np.array_equal(choice.load().samples.numpy(), samples[..., 2].T)
+    assert choice.load().spacing == (1, 2, 3)
+    assert choice.extent() == pytest.approx(120 ** (1 / 3))
+    assert choice.check("volume").upper == (3.5, 4.5, 5.5)
+
+
+@pytest.mark.parametrize(
+    ("volume", "words"),
+    [
+        ("series.nii", ["its 3 frames", "frame=0 to frame=2"]),
+        ({"file": "series.nii", "frame": 3}, ["from 0 to 2", "got frame 3"]),
+        ({"file": "lying.nii", "frame": 0}, ["32000000000 bytes"]),
+        ("batch.npy", ["one volume (D, H, W)", "(2, 1, 3, 4, 5)"]),
+    ],
+)
+def test_a_file_without_the_volume_is_refused_by_its_header(volume, words, tmp_path, scan, monkeypatch, capsys):
+    path, _ = series_of(tmp_path)
+    lying = bytearray(path.read_bytes())
+    struct.pack_into("<5h", lying, 40, 4, 2000, 2000, 2000, 4)
+    (tmp_path / "lying.nii").write_bytes(lying)
+    np.save(tmp_path / "batch.npy", np.zeros((2, 1, 3, 4, 5)))
+    monkeypatch.setenv("FILTERLAB_VOLUMES", str(tmp_path))
+    assert_refused({**tiny("dvr_volume", scan), "volume": volume}, [": volume: ", *words], tmp_path, capsys)
+
+
+def assert_refused(config, words, tmp_path, capsys, code=2):
+    """The command ends with one line that has all the words, and writes nothing."""
+    (tmp_path / "refused.yaml").write_text(yaml.safe_dump(config))
+    assert main(["run", str(tmp_path / "refused.yaml"), "--runs", str(tmp_path / "runs")]) == code
+    message = capsys.readouterr().err
+    assert len(message.splitlines()) == 1
+    for word in words:
+        assert word in message
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("name", ["dvr_signal", "dvr_volume", "texture_precision"])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"step": 1e-9}, ["view.step", "at most 1.7e+10 samples", "a longer step"]),
+        ({"size": [32768, 32768], "step": 0.01}, ["view.step", "samples"]),
+        ({"size": [10, 20]}, ["view.size", "at least 11 pixels"]),
+    ],
+)
+def test_a_view_that_cannot_be_drawn_is_refused_before_work(name, change, words, tmp_path, scan, capsys):
+    config = tiny(name, scan)
+    view = config["sources"][0]["view"] if name == "texture_precision" else config["view"]
+    changed = {**view, **change}
+    if name == "texture_precision":
+        config["sources"][0]["view"] = changed
+    else:
+        config["view"] = changed
+    if name == "dvr_volume" and "size" in change and "step" not in change:
+        assert EXPERIMENTS[name].check(EXPERIMENTS[name].config.model_validate(config), "") is None  # compares nothing
+        return
+    assert_refused(config, words, tmp_path, capsys)
+
+
+def test_the_samples_of_a_view_are_estimated_well(scan):
+    """Against the renderer's own count, which it names when it refuses."""
+    view = View.model_validate({**VIEW, "size": [240, 160], "camera": {"direction": [0.2, 1.0, -0.8], "margin": 2.0}})
+    field = fl.reconstruct(fl.load_volume(scan), "trilinear")
+    transfer = view.transfer.build(lambda: (0.0, 1.0), 1.0)
+    with pytest.raises(ValueError, match="the limit") as refusal:
+        fl.render.render(
+            field, view.camera.build(field.domain, view.size), transfer, size=view.size, step=1.0, max_samples=1
+        )
+    exact = float(re.search(r"take ([0-9.e+]+) samples", str(refusal.value)).group(1))
+    assert view._samples(field.domain) == pytest.approx(exact, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (ValueError("expected a;\n got b"), "expected a; got b"),
+        (MemoryError(), "expected enough memory"),
+        (torch.OutOfMemoryError("CUDA out of memory"), "expected enough memory"),
+        (None, "expected enough memory"),
+    ],
+)
+def test_what_only_the_work_finds_out_ends_in_one_line(error, said, tiny_rms, tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        if error is not None:
+            raise error
+        return torch.empty(2**50)  # the allocator's own words
+
+    monkeypatch.setattr("experiments.rms_error._error", fail)
+    assert main(["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]) == 1
+    message = capsys.readouterr().err
+    assert message.splitlines()[-1].startswith(f"error: gaussian 4³, trilinear: {said}")
+    assert "Traceback" not in message
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert not read_records(folder)[0]
+    assert not (folder / "report.html").exists()
+
+
+def test_a_mistake_of_ours_keeps_its_traceback(tiny_rms, tmp_path, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("shapes do not match")
+
+    monkeypatch.setattr("experiments.rms_error._error", fail)
+    with pytest.raises(RuntimeError, match="shapes"):
+        main(["run", str(tiny_rms), "--runs", str(tmp_path / "runs")])
+
+
+def test_the_response_of_the_sampled_scheme_is_measured(ran):
+    sampled = {"method": "trilinear", "gradient": "central", "scheme": "eight_trilinear"}
+    _, records, _ = ran("frequency_response", methods=["trilinear", sampled], figures=[])
+    assert all(record["largest_difference"] < 1e-6 for record in records.values())
+    assert len(records) == 2
 
 
 def test_a_missing_volume_is_found_before_anything_is_written(tmp_path, scan, capsys):

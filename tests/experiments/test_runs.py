@@ -2,6 +2,7 @@
 
 import json
 import signal
+import subprocess
 import time
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 
 from experiments.__main__ import main
 from experiments.config import ExperimentConfig
-from experiments.runs import Run, RunError, config_hash, read_provenance, read_records, run_folder
+from experiments.runs import Run, RunError, _commit, config_hash, read_provenance, read_records, run_folder
 
 START = {"started": "2026-01-01T00:00:00+00:00"}
 
@@ -109,7 +110,11 @@ def test_a_torn_last_line_is_cut_off_and_redone(tmp_path):
         with opened(tmp_path / "run") as run:
             assert [run.done(key) for key in "abc"] == [True, True, False]
             run.append("c", {"x": 1})
-        assert path.read_bytes() == whole
+        lines = path.read_bytes().splitlines(keepends=True)
+        assert lines[:2] == whole.splitlines(keepends=True)[:2]
+        start = run.start["start"]
+        assert start > 1
+        assert json.loads(lines[2]) == {"key": "c", "start": start, "x": 1}
 
 
 def test_damage_before_whole_records_is_not_thrown_away(tmp_path):
@@ -172,6 +177,87 @@ def test_a_changed_config_gets_another_folder_and_fresh_a_new_one(tmp_path):
     with opened(tmp_path / "y"):
         pass
     with pytest.raises(RunError, match="another config"), opened(tmp_path / "y", count=5):
+        pass
+
+
+def test_records_name_the_start_that_made_them(tmp_path):
+    folder = tmp_path / "run"
+    for key in "ab":
+        with opened(folder) as run:
+            run.section("part").append(key, {})
+    with (folder / "provenance.jsonl").open("a") as file:
+        file.write('{"start": 3, "sta')  # torn by a kill
+    with opened(folder) as run:
+        run.append("c", {})
+    assert [record["start"] for record in read_records(folder)[0].values()] == [1, 2, 3]
+    assert read_provenance(folder) == [{"start": n, **START} for n in (1, 2, 3)]
+
+
+@pytest.mark.parametrize("changed", [{"commit": "b"}, {"filterlab": "2"}])
+def test_other_code_is_known_by_the_records_it_made(tmp_path, changed):
+    code = {**START, "commit": "a", "filterlab": "1"}
+
+    def start(key, **changes):
+        with Run.open(tmp_path / "run", config(), {**code, **changes}) as run:
+            others = run.made_by_other_code()
+            if key:
+                run.append(key, {})
+            return [s["start"] for s in others]
+
+    assert start(None, **changed) == []
+    assert start("a") == []  # the first start made nothing: nothing is mixed
+    assert start("b") == []
+    assert start(None, **changed) == [2, 3]
+    assert start("c", **changed) == [2, 3]
+    assert start(None) == [5]
+
+
+def test_a_run_goes_on_with_other_code_only_with_a_warning(tiny_rms, tmp_path, monkeypatch, capsys):
+    arguments = ["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]
+    monkeypatch.setattr("experiments.runs._commit", lambda: "aaaa")
+    assert main(arguments) == 0
+    assert main(arguments) == 0
+    assert "warning" not in capsys.readouterr().err
+    monkeypatch.setattr("experiments.runs._commit", lambda: "bbbb")
+    assert main(arguments) == 0
+    (warning,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    for word in ("aaaa", "bbbb", "mixes records of both", "--fresh"):
+        assert word in warning
+    assert main([*arguments, "--fresh"]) == 0
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_changed_files_change_the_commit(tmp_path, monkeypatch):
+    def git(*words):
+        identity = ("-c", "user.name=n", "-c", "user.email=e", "-c", "commit.gpgsign=false")
+        subprocess.run(["git", "-C", str(tmp_path), *identity, *words], check=True, capture_output=True)
+
+    monkeypatch.setattr("experiments.runs.__file__", str(tmp_path / "runs.py"))
+    git("init")
+    found = []
+    for text in ("1", "2", "3"):
+        (tmp_path / "runs.py").write_text(text)
+        if text == "1":
+            git("add", ".")
+            git("commit", "-m", "one")
+        found.append(_commit())
+    assert len(set(found)) == 3
+    clean, *changed = found
+    assert len(clean) == 12
+    assert all(name.startswith(f"{clean}+changes.") for name in changed)
+
+
+def test_other_input_files_get_another_folder(tmp_path):
+    files = [{"/a": "1"}, {"/a": "2"}, {"/b": "1"}, {}]
+    folders = [run_folder(tmp_path, "x", config(), inputs) for inputs in files]
+    assert len(set(folders)) == len(files)
+    assert folders[3] == run_folder(tmp_path, "x", config())
+    with Run.open(tmp_path / "x", config(), {**START, "inputs": files[0]}):
+        pass
+    with (
+        pytest.raises(RunError, match="other input files"),
+        Run.open(tmp_path / "x", config(), {**START, "inputs": files[1]}),
+    ):
         pass
 
 
@@ -239,4 +325,4 @@ def test_records_are_plain_json(tmp_path):
         with pytest.raises(ValueError, match="JSON"):
             run.append("b", {"number": float("inf")})
     (line,) = (tmp_path / "run" / "records.jsonl").read_text().splitlines()
-    assert json.loads(line) == {"key": "a", "words": "ω", "number": 0.1}
+    assert json.loads(line) == {"key": "a", "start": 1, "words": "ω", "number": 0.1}
