@@ -102,7 +102,7 @@ class Config(ExperimentConfig):
     boundary: BoundaryName = "mirror"
     points: Annotated[int, Field(ge=10, le=10**8)] = 50_000
     inner: Annotated[float, Field(gt=0, le=1)] = 0.8
-    amplify: Annotated[float, Field(gt=0)] = 50.0
+    amplify: Annotated[float, Field(gt=0)] = 200.0
 
     @model_validator(mode="after")
     def _sampled(self) -> Config:
