@@ -108,18 +108,13 @@ class Method:
         quasi_interpolates = (
             self.kernel.direct_order == self.kernel.approximation_order or not self.prefilter.is_identity
         )
-        interpolates = (
-            self.prefilter.factors == prefilters.interpolation(self.kernel).factors
-            if _invertible(self.kernel)
-            else False
-        )
         return Facts(
             support=self.kernel.support,
             taps=self.taps or evaluated**3,
             approximation_order=self.kernel.approximation_order if quasi_interpolates else self.kernel.direct_order,
             approximation_order_without_prefilter=self.kernel.direct_order,
             continuity=self.kernel.continuity if self.continuity is None else self.continuity,
-            interpolating=interpolates,
+            interpolating=_interpolates(self.kernel, self.prefilter),
             interpolating_without_prefilter=self.kernel.interpolating,
             prefiltered=not self.prefilter.is_identity,
             gradients=self.gradients,
@@ -154,11 +149,12 @@ class Method:
         return (Direct if analytic else DirectCentral)(self.value_terms, name or "direct")
 
 
-def _invertible(kernel: Kernel) -> bool:
-    """Whether a prefilter exists with which the kernel interpolates (the notch has none)."""
+def _interpolates(kernel: Kernel, prefilter: Prefilter) -> bool:
+    """Whether the prefilter is the one with which the kernel interpolates (for the notch none exists)."""
     try:
-        return prefilters.interpolation(kernel).poles is not None
-    except ValueError:
+        needed = prefilters.interpolation(kernel)
+        return (needed.is_identity or len(needed.poles) > 0) and prefilter.factors == needed.factors
+    except ValueError:  # no such prefilter: the kernel is not symmetric, or its samples cannot be inverted
         return False
 
 

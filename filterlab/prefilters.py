@@ -36,7 +36,7 @@ class Prefilter:
 
     Attributes:
         name: as in the registry.
-        factors: each factor (q₀, q₁, …) stands for q̂(ω) = q₀ + 2 Σ_k q_k cos(kω); q̂(0) = 1. None: the identity.
+        factors: each factor (q₀, q₁, …) stands for q̂(ω) = q₀ + 2 Σ_k q_k cos(kω); q̂(0) = 1. Empty: the identity.
     """
 
     name: str

@@ -17,11 +17,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from filterlab.fields.grid import Coefficients, Term
-from filterlab.fields.tensor_product import Sampler, along, unit_steps, with_exact_positions
+from filterlab.fields.tensor_product import Sampler, along, unit_steps, with_central_differences, with_exact_positions
 from filterlab.kernels import CATMULL_ROM, LINEAR
 
 NCRSI_TERMS: tuple[Term, ...] = (
@@ -52,4 +51,4 @@ class SevenSamples:
             value = value - w[:, None] * (a - 2 * center + b)
         if order == 0:
             return value[:, :, None]
-        return torch.stack([value, *((a - b) / 2 for a, b in zip(ahead, behind, strict=True))], 2)
+        return with_central_differences(value, ahead, behind)

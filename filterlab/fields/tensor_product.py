@@ -247,11 +247,15 @@ class TrilinearCentral:
         value = self.sample(coefficients, points)
         if order == 0:
             return value[:, :, None]
-        ahead, behind = unit_steps(self.sample, coefficients, points)
-        return torch.stack([value, *((a - b) / 2 for a, b in zip(ahead, behind, strict=True))], 2)
+        return with_central_differences(value, *unit_steps(self.sample, coefficients, points))
 
 
 def unit_steps(sample: Sampler, coefficients: Coefficients, points: Tensor) -> tuple[list[Tensor], list[Tensor]]:
     """Trilinear samples one voxel ahead and one behind along x, y and z."""
     steps = torch.eye(3, dtype=points.dtype, device=points.device)
     return [sample(coefficients, points + s) for s in steps], [sample(coefficients, points - s) for s in steps]
+
+
+def with_central_differences(value: Tensor, ahead: list[Tensor], behind: list[Tensor]) -> Tensor:
+    """The rows of a jet of order 1: the value (N, C, M), and half the difference of the samples along each axis."""
+    return torch.stack([value, *((a - b) / 2 for a, b in zip(ahead, behind, strict=True))], 2)
