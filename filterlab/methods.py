@@ -6,19 +6,18 @@ To add one, add an entry to `METHODS`; the tests, the experiments and the comman
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from filterlab import kernels, ops, prefilters
+from filterlab import kernels, prefilters
 from filterlab.fields.base import Field
-from filterlab.fields.grid import Coefficients, GridField, Scheme, Term
+from filterlab.fields.grid import Coefficients, GridField, Scheme, Term, implementation_of
 from filterlab.fields.ncrsi import NCRSI_TERMS, SevenSamples
 from filterlab.fields.tensor_product import (
     Direct,
-    DirectCentral,
     EightTrilinearCubic,
     EightTrilinearQuadratic,
     Sampler,
@@ -27,6 +26,7 @@ from filterlab.fields.tensor_product import (
     same_kernel,
 )
 from filterlab.kernels import Kernel, PiecewisePolynomial, TensorKernel
+from filterlab.ops import autograd
 from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary, Volume, as_volume
 
@@ -123,11 +123,11 @@ class Method:
 
     @property
     def schemes(self) -> tuple[str, ...]:
-        """The ways of evaluating it, the default first."""
-        return ("direct", "fused") if self.sampled is None else ("direct", "fused", "eight_trilinear")
+        """The ways of evaluating it; the first one that can run is the default."""
+        return ("fused", "direct") if self.sampled is None else ("fused", "direct", "eight_trilinear")
 
     def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> Scheme:
-        """The scheme of that name with that kind of gradient (None: the default of either).
+        """The scheme of that name with that kind of gradient (None: the first one of either).
 
         Raises ValueError for a name or a combination that the method does not offer, with those it does.
         """
@@ -145,8 +145,7 @@ class Method:
             return self.sampled(named_sampler(sampler))
         if sampler != "exact":
             raise ValueError(f"sampler={sampler!r} needs scheme='eight_trilinear'; a sum over taps takes no samples")
-        analytic = (gradient or self.gradients[0]) == "analytic"
-        return (Direct if analytic else DirectCentral)(self.value_terms, name or "direct")
+        return Direct(self.value_terms, name or self.schemes[0], gradient or self.gradients[0])
 
 
 def _interpolates(kernel: Kernel, prefilter: Prefilter) -> bool:
@@ -255,9 +254,10 @@ def reconstruct(
             prefilter with which it does, a `TensorKernel` has none and needs prefilter=False.
         boundary: how the samples go on beyond the ends: mirror, reflect, wrap, border or zeros.
         prefilter: False to sum the samples themselves (blurs with a kernel that does not interpolate).
-        scheme: `direct` (default; plain torch, any device), `fused` (the same sum in vector code compiled for this
-            processor, 3 to 13 times as fast along a ray) or, where the method offers it, `eight_trilinear` (for
-            trilinear, whose gradient it takes by central differences, together with gradient="central").
+        scheme: `fused` (the sum over taps in vector code compiled for this processor), `direct` (the same sum in plain
+            torch, on any device) or, where the method offers it, `eight_trilinear` (for trilinear, whose gradient it
+            takes by central differences, together with gradient="central"). Default: `fused` where it can run, else
+            `direct`; `field.scheme.name` says which.
         gradient: `analytic` or `central`, where the method offers both; default: the method's own.
         sampler: for `eight_trilinear`: `exact`, `texture_unit` (8-bit fractions) or a callable.
 
@@ -282,14 +282,16 @@ def reconstruct(
         chosen.reach,
         method.factor,
     )
-    if chosen.name == "fused" and (why := _missing_for_fused(coefficients, chosen)):
-        raise ValueError(f"scheme='fused' can't run here: {why}; scheme='direct' can")
+    if isinstance(chosen, Direct) and chosen.name == "fused" and (why := _missing_for_fused(coefficients, chosen)):
+        if scheme is not None:
+            raise ValueError(f"scheme='fused' can't run here: {why}; scheme='direct' can")
+        chosen = replace(chosen, name="direct")
     return GridField(method.name, volume, coefficients, chosen)
 
 
-def _missing_for_fused(coefficients: Coefficients, scheme: Scheme) -> str | None:
+def _missing_for_fused(coefficients: Coefficients, scheme: Direct) -> str | None:
     """What the fused sum lacks for these coefficients, or None."""
     values = coefficients.values.detach().reshape(-1, 1, *coefficients.values.shape[-3:])
     points = torch.empty(values.shape[0], 0, 3, device=values.device)
-    reasons = (ops.cpu.missing(values, points, term.kernels, 1) for term in scheme.terms)
-    return next((why for why in reasons if why), None)
+    missing = autograd.MISSING[implementation_of("fused", values.device)]
+    return missing(values, points, scheme.stencils[1], None, coefficients.start)

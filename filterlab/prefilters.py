@@ -1,4 +1,4 @@
-"""Prefilters: from samples to the coefficients that a kernel is summed with.
+"""Prefilters: what turns samples into the coefficients that a kernel is summed with. `ops.prefilter` computes it.
 
 A prefilter undoes discrete symmetric filters q: c = q⁻¹ ∗ f, P(ω) = Π 1 / q̂(ω). Written with its poles z (|z| < 1) the
 inverse of one factor is the symmetric two-sided exponential
@@ -20,14 +20,12 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from filterlab.kernels import Kernel, bspline
-from filterlab.volume import Boundary
 
 
 @dataclass(frozen=True)
@@ -126,78 +124,3 @@ def named(prefilter: str | Prefilter) -> Prefilter:
     if prefilter not in PREFILTERS:
         raise ValueError(f"unknown prefilter {prefilter!r}; known prefilters: {', '.join(PREFILTERS)}")
     return PREFILTERS[prefilter]
-
-
-class _TwoSidedExponential(torch.autograd.Function):
-    """A causal and an anticausal recursion along axis 0, both started from zero.
-
-    With L the causal one as a matrix this is y = (1−z)² Lᵀ L x: symmetric, so it is its own adjoint, exactly.
-    """
-
-    @staticmethod
-    def forward(x: Tensor, pole: float) -> Tensor:
-        y = x * (1 - pole) ** 2
-        rows = y.unbind(0)
-        for previous, row in pairwise(rows):
-            row.add_(previous, alpha=pole)
-        for following, row in pairwise(reversed(rows)):
-            row.add_(following, alpha=pole)
-        return y
-
-    @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
-        ctx.pole = inputs[1]
-
-    @staticmethod
-    def backward(ctx, *gradients: Tensor):
-        return _two_sided_exponential(gradients[0], ctx.pole), None
-
-    @staticmethod
-    def jvp(ctx, *tangents):
-        return _two_sided_exponential(tangents[0], ctx.pole)
-
-    @staticmethod
-    def vmap(info, in_dims, x: Tensor, pole: float):
-        return _two_sided_exponential(x.movedim(in_dims[0], -1), pole), x.ndim - 1
-
-
-def _two_sided_exponential(x: Tensor, pole: float) -> Tensor:
-    return _TwoSidedExponential.apply(x, pole)  # type: ignore[return-value]
-
-
-def prefilter_axis(
-    samples: Tensor, dim: int, prefilter: str | Prefilter, boundary: str | Boundary = Boundary.MIRROR, tail: int = 0
-) -> Tensor:
-    """Coefficients along one axis.
-
-    Args:
-        samples: any shape, floating point.
-        dim: the axis to filter.
-        prefilter: a name from `PREFILTERS` or a `Prefilter`.
-        tail: coefficients to return beyond each end (border and zeros need them; see the head of this file).
-
-    Returns:
-        the coefficients, `samples.shape` with n + 2·tail along `dim`. Linear in the samples, with an exact adjoint.
-    """
-    boundary, prefilter = Boundary.named(boundary), named(prefilter)
-    warm_up = prefilter.decay(samples.dtype)
-    lines = boundary.extend(samples, dim, tail + warm_up, tail + warm_up).movedim(dim, 0).contiguous()
-    for pole in prefilter.poles:
-        lines = _two_sided_exponential(lines, pole)
-    return lines[warm_up : lines.shape[0] - warm_up].movedim(0, dim)
-
-
-def prefilter_samples(
-    samples: Tensor, prefilter: str | Prefilter, boundary: str | Boundary = Boundary.MIRROR
-) -> Tensor:
-    """Coefficients of a whole volume `(..., D, H, W)`: `prefilter_axis` along x, y and z, same shape and dtype.
-
-    Under border and zeros these are the coefficients inside the volume only; `reconstruct` keeps the tails as well.
-    Integer, float16 and bfloat16 samples are filtered in float32. Differentiable in the samples.
-    """
-    if samples.ndim < 3:
-        raise ValueError(f"samples must have shape (..., D, H, W); got {tuple(samples.shape)}")
-    out = samples.to(torch.promote_types(samples.dtype, torch.float32))
-    for dim in (-3, -2, -1):
-        out = prefilter_axis(out, dim, prefilter, boundary)
-    return out

@@ -122,7 +122,7 @@ def _along_axis(values: Tensor, dim: int, positions: Tensor, kernel: PiecewisePo
     """Σ_t weight_t(position) · values[first tap + t] along one axis."""
     first, u = locate(positions, kernel.support, values.shape[dim], start)
     total = None
-    for t, weight in enumerate(tap_weights(u, kernel, 0)[0]):
+    for t, weight in tap_weights(u, (kernel, 0), kernel.support).items():
         weight = weight.to(values.dtype).reshape(-1, *(1 for _ in range(-1 - dim)))
         part = weight * values.index_select(dim, first + t)
         total = part if total is None else total + part

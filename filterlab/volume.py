@@ -19,6 +19,8 @@ from torch import Tensor
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+Matrix = tuple[tuple[float, float, float], ...]
+
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -80,6 +82,18 @@ class Boundary(StrEnum):
             out = torch.where(inside, out, torch.zeros((), dtype=x.dtype, device=x.device))
         return out
 
+    def interval(self, n: int, tail: int) -> tuple[float, float]:
+        """(low, high) between which folded coordinates lie."""
+        match self:
+            case Boundary.MIRROR:
+                return 0.0, n - 1.0
+            case Boundary.REFLECT:
+                return -0.5, n - 0.5
+            case Boundary.WRAP:
+                return 0.0, float(n)
+            case _:
+                return -float(tail), n - 1.0 + tail
+
     def fold(self, x: Tensor, n: int, tail: int) -> tuple[Tensor, Tensor]:
         """Coordinates folded or clamped to where coefficients are stored, and the derivative d folded / d x.
 
@@ -94,25 +108,10 @@ class Boundary(StrEnum):
             points already there are returned bit for bit. sign = d folded / d x, everywhere: +1, −1 where a reflection
             turned the axis round, 0 where the extension is constant.
         """
-        return _Fold.apply(x, self, n, tail)  # type: ignore[return-value]
-
-    def _interval(self, n: int, tail: int) -> tuple[float, float]:
-        """Where folded coordinates lie."""
-        match self:
-            case Boundary.MIRROR:
-                return 0.0, n - 1.0
-            case Boundary.REFLECT:
-                return -0.5, n - 0.5
-            case Boundary.WRAP:
-                return 0.0, float(n)
-            case _:
-                return -float(tail), n - 1.0 + tail
-
-    def _fold(self, x: Tensor, n: int, tail: int) -> tuple[Tensor, Tensor]:
-        low, high = self._interval(n, tail)
+        low, high = self.interval(n, tail)
         one = x.new_ones(()).expand_as(x)
         if high > low and _all_between(x, low, high):
-            return x.clone(), one
+            return x, one
         match self:
             case Boundary.MIRROR if n == 1:
                 return torch.where(x.isfinite(), torch.zeros_like(x), torch.full_like(x, torch.nan)), 0 * one
@@ -135,34 +134,6 @@ def _all_between(x: Tensor, low: float, high: float) -> bool:
     return low <= float(least) and float(most) <= high
 
 
-class _Fold(torch.autograd.Function):
-    """Folded coordinates with d folded / d x = sign, also on the planes of reflection, where |·| and min have none."""
-
-    @staticmethod
-    def forward(x: Tensor, boundary: Boundary, n: int, tail: int) -> tuple[Tensor, Tensor]:
-        return boundary._fold(x, n, tail)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
-        ctx.mark_non_differentiable(output[1])
-        ctx.save_for_backward(output[1])
-        ctx.save_for_forward(output[1])
-
-    @staticmethod
-    def backward(ctx, *gradients: Tensor):
-        (sign,) = ctx.saved_tensors
-        return gradients[0] * sign, None, None, None
-
-    @staticmethod
-    def jvp(ctx, *tangents):
-        (sign,) = ctx.saved_tensors
-        return tangents[0] * sign, None
-
-    @staticmethod
-    def vmap(info, in_dims, x: Tensor, boundary: Boundary, n: int, tail: int):
-        return boundary.fold(x, n, tail), (in_dims[0], in_dims[0])
-
-
 def _reflect_at(x: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
     """x reflected at `low` and `high` until it lies between, and the sign ±1 of d reflected / d x."""
     period = 2 * (high - low)
@@ -172,6 +143,10 @@ def _reflect_at(x: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
     other = (period - r).abs()
     turned = outside & ((w < 0) ^ (other < r) ^ (r > period))
     return torch.where(outside, torch.minimum(r, other) + low, x), 1 - 2 * turned.to(x.dtype)
+
+
+def _transposed(matrix: Matrix) -> Matrix:
+    return tuple(zip(*matrix, strict=True))
 
 
 def _triple(name: str, value: Sequence[float] | Tensor | np.ndarray | float) -> tuple[float, float, float]:
@@ -198,7 +173,7 @@ class Geometry:
         origin: world position of the centre of voxel (0, 0, 0).
     """
 
-    matrix: tuple[tuple[float, float, float], ...] = IDENTITY
+    matrix: Matrix = IDENTITY
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -207,6 +182,7 @@ class Geometry:
         regular = np.isfinite(m).all() and scale.min() > 0 and abs(np.linalg.det(m / scale)) >= 1e-9
         if not regular or not np.isfinite(self.origin).all():
             raise ValueError(f"the affine must be finite and invertible; got {self.affine.tolist()}")
+        _ = self.inverse, self.diagonal  # made now: torch.compile can't make them while it traces
 
     @classmethod
     def of(
@@ -254,34 +230,35 @@ class Geometry:
         return tuple(np.diag(m).tolist()) if np.count_nonzero(m - np.diag(np.diag(m))) == 0 else None  # type: ignore[return-value]
 
     @cached_property
-    def _inverse(self) -> np.ndarray:
-        return np.linalg.inv(np.asarray(self.matrix))
+    def inverse(self) -> Matrix:
+        """3 rows of the map from world steps to voxel steps."""
+        return tuple(map(tuple, np.linalg.inv(np.asarray(self.matrix)).tolist()))
 
-    def _map_rows(self, rows: Tensor, matrix: np.ndarray) -> Tensor:
+    def _map_rows(self, rows: Tensor, matrix: Matrix) -> Tensor:
         """rows · matrix; for world-aligned axes one product per component, so that nothing is mixed."""
         if self.diagonal is not None:
-            return rows * torch.as_tensor(np.diag(matrix).copy(), dtype=rows.dtype, device=rows.device)
-        return rows @ torch.as_tensor(matrix.copy(), dtype=rows.dtype, device=rows.device)
+            return rows * rows.new_tensor([row[i] for i, row in enumerate(matrix)])
+        return rows @ rows.new_tensor(matrix)
 
     def to_world(self, voxels: Tensor) -> Tensor:
         """Voxel coordinates `(..., 3)` to world points."""
         if self.is_identity:
             return voxels
-        return self._map_rows(voxels, np.asarray(self.matrix).T) + voxels.new_tensor(self.origin)
+        return self._map_rows(voxels, _transposed(self.matrix)) + voxels.new_tensor(self.origin)
 
     def to_voxel(self, points: Tensor) -> Tensor:
         """World points `(..., 3)` to voxel coordinates; the origin is subtracted before scaling."""
         if self.is_identity:
             return points
-        return self._map_rows(points - points.new_tensor(self.origin), self._inverse.T)
+        return self._map_rows(points - points.new_tensor(self.origin), _transposed(self.inverse))
 
     def direction_to_voxel(self, directions: Tensor) -> Tensor:
         """World directions `(..., 3)` to voxel steps (no origin)."""
-        return directions if self.is_identity else self._map_rows(directions, self._inverse.T)
+        return directions if self.is_identity else self._map_rows(directions, _transposed(self.inverse))
 
     def gradient_to_world(self, gradient: Tensor) -> Tensor:
         """Gradients `(..., 3)` per voxel to per world unit: g_world = matrix⁻ᵀ g_voxel."""
-        return gradient if self.is_identity else self._map_rows(gradient, self._inverse)
+        return gradient if self.is_identity else self._map_rows(gradient, self.inverse)
 
     def hessian_to_world(self, hessian: Tensor) -> Tensor:
         """Hessians `(..., 3, 3)` per voxel² to per world unit²: matrix⁻ᵀ H matrix⁻¹."""

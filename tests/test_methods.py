@@ -451,7 +451,7 @@ def test_many_points_are_chunked_and_give_the_same(method):
     [
         ({"method": "lanczos"}, "trilinear, catmull-rom, ncrsi"),
         ({"boundary": "clamp"}, "mirror, reflect, wrap, border, zeros"),
-        ({"scheme": "fuzed"}, "direct, fused, eight_trilinear"),
+        ({"scheme": "fuzed"}, "fused, direct, eight_trilinear"),
         ({"method": "catmull-rom", "scheme": "eight_trilinear"}, "direct"),
         ({"gradient": "central"}, "analytic"),
         ({"gradient": "sobel"}, "analytic"),

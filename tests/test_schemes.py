@@ -10,6 +10,7 @@ from filterlab.fields.base import Field
 from filterlab.fields.tensor_product import SAMPLERS, exact_sample
 from filterlab.kernels import bc
 from filterlab.methods import METHODS, reconstruct
+from filterlab.ops import autograd
 from filterlab.volume import Boundary
 from tests import laws, oracles
 
@@ -141,7 +142,7 @@ def test_a_field_tells_how_it_is_evaluated(method):
     assert sampled.scheme.name == "eight_trilinear"
     assert sampled.scheme.gradient == METHODS[method].sampled_gradient
     assert sampled.max_order == 1
-    assert reconstruct(volume(), method).scheme.name == "direct"
+    assert reconstruct(volume(), method).scheme.name == "fused"
 
 
 @pytest.mark.parametrize("method", ["trilinear", "ncrsi", "triquadratic", "notch", "tricubic"])
@@ -172,6 +173,16 @@ def test_a_fused_scheme_that_cannot_run_says_what_is_missing():
     kernel = bc(torch.tensor(0.3), torch.tensor(0.3))
     with pytest.raises(ValueError, match=r"can't run here: .*TensorKernel.*; scheme='direct' can"):
         reconstruct(volume(), kernel, prefilter=False, scheme="fused")
+
+
+def test_the_default_is_fused_where_it_can_run(monkeypatch):
+    kernel = bc(torch.tensor(0.3), torch.tensor(0.3))
+    assert reconstruct(volume(), kernel, prefilter=False).scheme.name == "direct"
+    assert reconstruct(volume(), "notch").scheme.name == "fused"
+    monkeypatch.setitem(autograd.MISSING, "cpu", lambda *_: "no such thing")
+    assert reconstruct(volume(), "notch").scheme.name == "direct"
+    with pytest.raises(ValueError, match="no such thing"):
+        reconstruct(volume(), "notch", scheme="fused")
 
 
 @pytest.mark.parametrize("method", list(METHODS))

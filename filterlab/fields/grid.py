@@ -15,10 +15,13 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from filterlab import ops
 from filterlab.fields.base import Domain, Field, check_order, check_points
 from filterlab.kernels import Factor, PiecewisePolynomial
-from filterlab.prefilters import Prefilter, prefilter_axis
-from filterlab.volume import Boundary, Volume
+from filterlab.ops.placement import Placement
+from filterlab.ops.prefilter import implementation_for, prefilter_samples
+from filterlab.prefilters import Prefilter
+from filterlab.volume import Boundary, Geometry, Volume
 
 
 @dataclass(frozen=True)
@@ -85,28 +88,33 @@ class Coefficients:
         Memory: (n + 2·pad)³ coefficients, pad = reach (+1 for a factored kernel) under mirror, reflect and wrap;
         under border and zeros 2·reach plus the prefilter's decay (about 10 … 50 voxels, see `Prefilter.decay`).
         """
-        values = samples if prefilter.is_identity else samples.to(torch.promote_types(samples.dtype, torch.float32))
         reach = reach if factor is None else reach + 1
-        decay = 0 if boundary.periodic else prefilter.decay(values.dtype)
+        decay = 0 if boundary.periodic else prefilter.decay(torch.promote_types(samples.dtype, torch.float32))
         tail = 0 if boundary.periodic else decay + reach
         pad = reach + tail - decay
-        for dim in (-3, -2, -1):
-            if not prefilter.is_identity:
-                values = prefilter_axis(values, dim, prefilter, boundary, decay)
-            values = boundary.extend(values, dim, pad, pad)
+        values = samples
+        if not prefilter.is_identity:  # periodic coefficients extend as the samples do
+            filtered = pad if boundary.periodic else decay
+            values = prefilter_samples(samples, prefilter, boundary, filtered, implementation_for(samples))
+        if prefilter.is_identity or not boundary.periodic:
+            for dim in (-3, -2, -1):
+                values = boundary.extend(values, dim, pad, pad)
         shift = 0.0
         if factor is not None:
             values, shift = _apply_factor(values, factor), 0.5
         d, h, w = samples.shape[-3:]
         return cls(values, -(pad + decay), shift, (w, h, d), boundary, tail)
 
-    def locate(self, voxels: Tensor) -> tuple[Tensor, Tensor]:
-        """Voxel coordinates (..., 3) folded and shifted to the coefficients, and the sign ±1 or 0 of each axis."""
-        axes = [self.boundary.fold(x, n, self.tail) for x, n in zip(voxels.unbind(-1), self.size, strict=True)]
-        folded = torch.stack([x for x, _ in axes], -1)
-        if self.shift:
-            folded = folded - self.shift
-        return folded, torch.stack([s for _, s in axes], -1)
+    def placement(self, geometry: Geometry) -> Placement:
+        """How world points become coordinates of these coefficients."""
+        return Placement(geometry, self.boundary, self.size, self.tail, self.shift)
+
+
+def implementation_of(scheme: str, device: torch.device) -> str:
+    """What computes a scheme's sums: for `fused` vector code on the CPU and Triton on a GPU, else plain torch."""
+    if scheme != "fused":
+        return "reference"
+    return "cuda" if device.type == "cuda" else "cpu"
 
 
 def _apply_factor(values: Tensor, factor: Factor) -> Tensor:
@@ -133,6 +141,7 @@ class GridField(Field):
         self.method = method
         self.scheme = scheme
         self.coefficients = coefficients
+        self.placement = coefficients.placement(volume.geometry)
         self.domain = Domain.of_grid(volume.size, volume.geometry)
         self.max_order = scheme.max_order
         self.channels = (volume.shape[0], volume.shape[1]) if volume.batched else None
@@ -164,15 +173,20 @@ class GridField(Field):
         points = check_points(points, self.channels)
         batched = points if self.channels is not None else points[None]
         flat = batched.reshape(batched.shape[0], math.prod(batched.shape[1:-1]), 3)
-        located, sign = self.coefficients.locate(self.domain.geometry.to_voxel(flat))
+        implementation = implementation_of(self.scheme.name, self.coefficients.values.device)
+        located, sign = ops.place(flat, self.placement, implementation)
         rows = self._rows(located, order)  # (N, C, J, M)
         shape = batched.shape[1:-1]
         out = [self._shaped(rows[:, :, 0], shape)]
         if order >= 1:
-            gradient = rows[:, :, 1:4].movedim(2, -1) * sign[:, None]
+            gradient = rows[:, :, 1:4].movedim(2, -1)
+            if sign is not None:
+                gradient = gradient * sign[:, None]
             out.append(self._shaped(self.domain.geometry.gradient_to_world(gradient), shape))
         if order >= 2:
-            hessian = _symmetric(rows[:, :, 4:10]) * (sign[..., :, None] * sign[..., None, :])[:, None]
+            hessian = _symmetric(rows[:, :, 4:10])
+            if sign is not None:
+                hessian = hessian * (sign[..., :, None] * sign[..., None, :])[:, None]
             out.append(self._shaped(self.domain.geometry.hessian_to_world(hessian), shape))
         return tuple(out)
 

@@ -9,8 +9,8 @@ texture unit.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import wraps
+from dataclasses import dataclass, field, replace
+from functools import cached_property, wraps
 from itertools import product
 from typing import Any, TypeVar
 
@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from filterlab import ops
-from filterlab.fields.grid import Coefficients, Term
+from filterlab.fields.grid import Coefficients, Term, implementation_of
 from filterlab.kernels import CENTRAL_DIFFERENCE, LINEAR, PiecewisePolynomial, bspline, horner
+from filterlab.ops import Product, Stencil, multi_indices
 
 Sampler = Callable[[Coefficients, Tensor], Tensor]
 """(coefficients with values (N, C, D, H, W), points (N, M, 3)) -> trilinear samples (N, C, M).
@@ -27,10 +28,12 @@ Sampler = Callable[[Coefficients, Tensor], Tensor]
 The first coefficient, `coefficients.values[..., 0, 0, 0]`, lies at `coefficients.start` along every axis.
 """
 
+_TRILINEAR = Stencil.jet(LINEAR, 0)
+
 
 def exact_sample(coefficients: Coefficients, points: Tensor) -> Tensor:
     """Trilinear interpolation in the dtype of the points."""
-    return ops.jet(coefficients.values, points, LINEAR, 0, coefficients.start)[:, :, 0]
+    return ops.gather(coefficients.values, points, _TRILINEAR, coefficients.start)[:, :, 0]
 
 
 def texture_unit_sample(coefficients: Coefficients, points: Tensor) -> Tensor:
@@ -94,56 +97,49 @@ CENTRAL_TERMS = tuple(along(axis, CENTRAL_DIFFERENCE) for axis in range(3))
 """∂f/∂x_d ≈ (T(x + e_d) − T(x − e_d)) / 2 with T the trilinear interpolant: each is a separable sum itself."""
 
 
-IMPLEMENTATION_OF = {"direct": "reference", "fused": "cpu"}
-"""The sum over taps goes by the name of what computes it."""
-
-
 @dataclass(frozen=True)
 class Direct:
-    """The sum over taps, Σ_terms weight · Σ_k c_k φ_x φ_y φ_z, with analytic derivatives up to the Hessian.
+    """The sum over taps, Σ_terms weight · Σ_k c_k φ_x φ_y φ_z, with analytic or central-difference gradients.
 
-    `direct` computes it in plain torch, `fused` in vector code made for this processor (`ops.cpu`).
+    `direct` computes it in plain torch, `fused` in vector code made for this processor (`ops.cpu`); either reads the
+    taps once for the value and all derivatives.
+
+    Attributes:
+        terms: the value.
+        gradient: `analytic`: derivatives of the terms, up to the Hessian. `central`: differences of the trilinear
+            interpolant, and nothing beyond.
     """
 
     terms: tuple[Term, ...]
     name: str = "direct"
     gradient: str = "analytic"
-    max_order: int = 2
+
+    def __post_init__(self) -> None:
+        _ = self.stencils  # made now: torch.compile can't make them while it traces
+
+    @property
+    def max_order(self) -> int:
+        return 2 if self.gradient == "analytic" else 1
 
     @property
     def reach(self) -> int:
-        return reach_of(self.terms)
+        return reach_of(self.terms if self.gradient == "analytic" else (*self.terms, *CENTRAL_TERMS))
 
-    def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
-        values, start = coefficients.values, coefficients.start
-        implementation = IMPLEMENTATION_OF[self.name]
-        parts = [ops.jet(values, points, term.kernels, order, start, implementation) for term in self.terms]
-        if len(parts) == 1 and self.terms[0].weight == 1:
-            return parts[0]
-        return sum(
-            (t.weight * p for t, p in zip(self.terms[1:], parts[1:], strict=True)), self.terms[0].weight * parts[0]
+    @cached_property
+    def stencils(self) -> tuple[Stencil, ...]:
+        """What is summed for a jet of order 0, 1, … `max_order`."""
+        value = tuple(Product(term.kernels, weight=term.weight) for term in self.terms)
+        if self.gradient == "central":
+            differences = tuple((Product(term.kernels),) for term in CENTRAL_TERMS)
+            return Stencil((value,)), Stencil((value, *differences))
+        return tuple(
+            Stencil(tuple(tuple(replace(p, orders=orders) for p in value) for orders in multi_indices(order)))
+            for order in range(self.max_order + 1)
         )
 
-
-@dataclass(frozen=True)
-class DirectCentral:
-    """Value by the direct sum, gradient by central differences of the trilinear interpolant, as sums over taps."""
-
-    terms: tuple[Term, ...]
-    name: str = "direct"
-    gradient: str = "central"
-    max_order: int = 1
-
-    @property
-    def reach(self) -> int:
-        return reach_of((*self.terms, *CENTRAL_TERMS))
-
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
-        value = Direct(self.terms, self.name).jet(coefficients, points, 0)
-        if order == 0:
-            return value
-        differences = [Direct((term,), self.name).jet(coefficients, points, 0) for term in CENTRAL_TERMS]
-        return torch.cat([value, *differences], 2)
+        implementation = implementation_of(self.name, coefficients.values.device)
+        return ops.gather(coefficients.values, points, self.stencils[order], coefficients.start, implementation)
 
 
 @dataclass(frozen=True)

@@ -1,48 +1,129 @@
-"""The numerical core: `jet` and its adjoint `splat`. Every evaluation in filterlab goes through these two.
+"""The numerical core: `gather` and its adjoint `scatter`. Every evaluation in filterlab goes through these two.
 
-`jet` and `splat` here choose the implementation: `reference` is plain torch, `cpu` fused vector code; `autograd` makes
-the pair differentiable, whichever computes it.
+`stencil` says what is summed; `gather` and `scatter` here choose what computes it: `reference` is plain torch, `cpu`
+fused vector code, `cuda` fused code for a GPU; `autograd` makes the pair differentiable, whichever it is. `jet` and
+`splat` are the pair for all partial derivatives of one tensor-product kernel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
-from filterlab.kernels import Kernel, PiecewisePolynomial
-from filterlab.ops import autograd, cpu, reference
+from filterlab.kernels import PiecewisePolynomial
+from filterlab.ops import autograd, compiled, placement
 from filterlab.ops.autograd import IMPLEMENTATIONS
-from filterlab.ops.reference import multi_indices
+from filterlab.ops.placement import Placed, Placement
+from filterlab.ops.stencil import Product, Stencil, multi_indices
 
-__all__ = ["IMPLEMENTATIONS", "jet", "multi_indices", "splat"]
+__all__ = [
+    "IMPLEMENTATIONS",
+    "Placement",
+    "Product",
+    "Stencil",
+    "gather",
+    "jet",
+    "multi_indices",
+    "place",
+    "scatter",
+    "splat",
+]
 
 
-def _per_axis(kernels: PiecewisePolynomial | Sequence[PiecewisePolynomial]) -> tuple[PiecewisePolynomial, ...]:
-    return (kernels,) * 3 if isinstance(kernels, PiecewisePolynomial) else tuple(kernels)
-
-
-def _check(
-    batch: Tensor, points: Tensor, kernels: Sequence[PiecewisePolynomial], order: int, shape: Sequence[int]
-) -> None:
+def _check(batch: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int]) -> None:
     if points.ndim != 3 or points.shape[-1] != 3 or not points.is_floating_point():
         raise ValueError(f"points must be floating point of shape (N, M, 3); got {points.dtype} {tuple(points.shape)}")
     if points.shape[0] != batch.shape[0]:
         raise ValueError(f"batch sizes differ: {batch.shape[0]} of the first argument, {points.shape[0]} of points")
-    if order < 0:
-        raise ValueError(f"order must be ≥ 0; got {order}")
-    for axis, kernel, n in zip("xyz", kernels, tuple(shape)[::-1], strict=True):
-        if n < kernel.support:
-            raise ValueError(f"axis {axis} has {n} coefficients; the kernel {kernel.name} needs {kernel.support}")
+    for axis, support, n in zip("xyz", stencil.supports, tuple(shape)[::-1], strict=True):
+        if n < support:
+            raise ValueError(f"axis {axis} has {n} coefficients; the stencil needs {support}")
 
 
-def _check_implementation(
-    name: str, values: Tensor, points: Tensor, kernels: Sequence[PiecewisePolynomial], order: int, *sizes
-) -> None:
+def _check_implementation(name: str, values: Tensor, points: Tensor, stencil: Stencil, *sizes) -> None:
     if name not in IMPLEMENTATIONS:
         raise ValueError(f"implementation must be one of {', '.join(IMPLEMENTATIONS)}; got {name!r}")
-    if name == "cpu" and (why := cpu.missing(values, points, kernels, order, *sizes)):
-        raise ValueError(f"implementation 'cpu' can't run here: {why}; implementation='reference' can")
+    if name in autograd.MISSING and (why := autograd.MISSING[name](values, points, stencil, *sizes)):
+        raise ValueError(f"implementation {name!r} can't run here: {why}; implementation='reference' can")
+
+
+def gather(
+    coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0, implementation: str = "reference"
+) -> Tensor:
+    """The rows of a stencil at the points: row = Σ_i weight_i Σ_k c_k φ_x^(m_x)(x−k_x) φ_y^(m_y) φ_z^(m_z).
+
+    Args:
+        coefficients: (N, C, D, H, W), any real dtype, each axis at least as long as the stencil's support.
+        points: (N, M, 3), x, y, z. Points beyond the coefficients are extrapolated from the outermost polynomial piece;
+            nothing is read out of bounds.
+        stencil: what is summed.
+        start: the coordinate of coefficient 0, the same along every axis (negative for padded coefficients).
+        implementation: a key of `IMPLEMENTATIONS`: "reference" (plain torch), "cpu" or "cuda" (fused; what they need
+            is told by `cpu.missing` and `cuda.missing`). Derivatives are computed by the same one, those above order 3
+            by the reference.
+
+    Returns:
+        (N, C, J, M) in the dtype of the points, J rows.
+
+    Differentiable any number of times in coefficients and points; in the tables of `TensorKernel`s too.
+
+    Raises:
+        ValueError: wrong shapes; an unknown implementation, or one that can't run as asked (the message says why).
+    """
+    if torch.compiler.is_compiling():
+        return compiled.gather(coefficients, points, compiled.stencil_text(stencil), start, implementation)
+    if coefficients.ndim != 5:
+        raise ValueError(f"coefficients must have shape (N, C, D, H, W); got {tuple(coefficients.shape)}")
+    _check(coefficients, points, stencil, coefficients.shape[2:])
+    _check_implementation(implementation, coefficients, points, stencil, None, start)
+    return autograd.gather(coefficients, points, stencil, start, implementation)
+
+
+def scatter(
+    cotangents: Tensor,
+    points: Tensor,
+    stencil: Stencil,
+    shape: Sequence[int],
+    start: int = 0,
+    implementation: str = "reference",
+) -> Tensor:
+    """The adjoint of `gather`: ⟨gather(c), g⟩ = ⟨c, scatter(g)⟩.
+
+    Args:
+        cotangents: (N, C, J, M), as `gather` returns.
+        points, stencil, start, implementation: as for `gather`.
+        shape: (D, H, W) of the result.
+
+    Returns:
+        (N, C, D, H, W) in the dtype of the points. A point that is not finite adds nothing. Differentiable any number
+        of times in cotangents and points.
+    """
+    if torch.compiler.is_compiling():
+        return compiled.scatter(cotangents, points, compiled.stencil_text(stencil), shape, start, implementation)
+    rows = len(stencil.rows)
+    if cotangents.ndim != 4 or cotangents.shape[2:] != (rows, points.shape[1]):
+        raise ValueError(f"cotangents must have shape (N, C, {rows}, M); got {tuple(cotangents.shape)}")
+    _check(cotangents, points, stencil, shape)
+    _check_implementation(implementation, cotangents, points, stencil, shape, start)
+    return autograd.scatter(cotangents, points, stencil, tuple(shape), start, implementation)
+
+
+def place(points: Tensor, where: Placement, implementation: str = "reference") -> Placed:
+    """World points `(..., 3)` to coordinates of coefficients: (located, sign).
+
+    located = fold(matrix · (point − origin)) − shift, sign = d fold / d voxel along each axis: 1, −1 where a reflection
+    turned the axis round, 0 where the extension is constant. Any finite coordinate folds exactly; ±inf gives NaN under
+    the periodic boundaries and clamps under border and zeros; NaN stays NaN.
+
+    Returns:
+        both `(..., 3)` in the dtype of the points; sign None where it is 1 everywhere and no derivative is asked.
+        Differentiable in the points, any number of times: d located_i / d point_j = sign_i · matrix_ij.
+    """
+    if torch.compiler.is_compiling():
+        return compiled.place(points, compiled.placement_text(where), implementation)
+    return placement.place(points, where, implementation)
 
 
 def jet(
@@ -55,32 +136,10 @@ def jet(
 ) -> Tensor:
     """All partial derivatives up to `order` of Σ_k c_k φ_x(x−k_x) φ_y(y−k_y) φ_z(z−k_z) at the points.
 
-    Args:
-        coefficients: (N, C, D, H, W), any real dtype, each axis at least as long as its kernel's support.
-        points: (N, M, 3), x, y, z. Points beyond the coefficients are extrapolated from the outermost polynomial piece;
-            nothing is read out of bounds.
-        kernels: one kernel, or one per axis x, y, z.
-        order: 0 value, 1 + gradient, 2 + Hessian, …; rows as in `multi_indices(order)`.
-        start: the coordinate of coefficient 0, the same along every axis (negative for padded coefficients).
-        implementation: a key of `IMPLEMENTATIONS`: "reference" (plain torch) or "cpu" (fused; see `cpu.missing` for
-            what it needs). Derivatives are computed by the same one, those above order 3 by the reference.
-
-    Returns:
-        (N, C, J, M) in the dtype of the points.
-
-    Differentiable any number of times in coefficients and points; in the tables of `TensorKernel`s too.
-
-    Raises:
-        ValueError: wrong shapes; an unknown implementation, or one that can't run as asked (the message says why).
+    `gather` of `Stencil.jet(kernels, order)`: one kernel, or one per axis x, y, z; order 0 value, 1 + gradient,
+    2 + Hessian, …; rows as in `multi_indices(order)`.
     """
-    kernels = _per_axis(kernels)
-    if coefficients.ndim != 5:
-        raise ValueError(f"coefficients must have shape (N, C, D, H, W); got {tuple(coefficients.shape)}")
-    _check(coefficients, points, kernels, order, coefficients.shape[2:])
-    _check_implementation(implementation, coefficients, points, kernels, order, None, start)
-    if all(isinstance(k, Kernel) for k in kernels):
-        return autograd.jet(coefficients, points, kernels, order, start, implementation)  # type: ignore[arg-type]
-    return reference.jet(coefficients, points, kernels, order, start)
+    return gather(coefficients, points, Stencil.jet(kernels, order), start, implementation)
 
 
 def splat(
@@ -92,30 +151,5 @@ def splat(
     start: int = 0,
     implementation: str = "reference",
 ) -> Tensor:
-    """The adjoint of `jet`: ⟨jet(c), g⟩ = ⟨c, splat(g)⟩.
-
-    Args:
-        cotangents: (N, C, J, M), as `jet` returns.
-        points, kernels, order, start, implementation: as for `jet`.
-        shape: (D, H, W) of the result.
-
-    Returns:
-        (N, C, D, H, W) in the dtype of the points. Differentiable any number of times in cotangents and points.
-    """
-    kernels = _per_axis(kernels)
-    rows = len(multi_indices(order))
-    if cotangents.ndim != 4 or cotangents.shape[2:] != (rows, points.shape[1]):
-        raise ValueError(f"cotangents must have shape (N, C, {rows}, M); got {tuple(cotangents.shape)}")
-    _check(cotangents, points, kernels, order, shape)
-    _check_implementation(implementation, cotangents, points, kernels, order, shape, start)
-    if all(isinstance(k, Kernel) for k in kernels):
-        return autograd.splat(
-            cotangents,
-            points,
-            kernels,  # type: ignore[arg-type]
-            order,
-            tuple(shape),
-            start,
-            implementation,
-        )
-    return reference.splat(cotangents, points, kernels, order, shape, start)
+    """The adjoint of `jet`: `scatter` of `Stencil.jet(kernels, order)`."""
+    return scatter(cotangents, points, Stencil.jet(kernels, order), shape, start, implementation)

@@ -1,30 +1,23 @@
-"""jet and splat in plain torch: any device, dtype and order. The other implementations are tested against this one.
+"""gather and scatter in plain torch: any device, dtype and stencil. The other implementations are tested against it.
 
-Letters: N batch, C channels, M points; x, y, z along W, H, D; S taps per axis; u ∈ [0, 1) the local coordinate; m the
-order of a derivative. A jet's rows are the multi-indices (m_x, m_y, m_z), m_x + m_y + m_z ≤ order, graded:
-(0,0,0); (1,0,0) (0,1,0) (0,0,1); (2,0,0) (1,1,0) (1,0,1) (0,2,0) (0,1,1) (0,0,2); …
+Letters: N batch, C channels, M points, J rows; x, y, z along W, H, D; S taps per axis; u ∈ [0, 1) the local coordinate;
+a, b, c weight functions along x, y, z (a kernel and the order of its derivative).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from itertools import groupby
+from operator import itemgetter
 
 import torch
 from torch import Tensor
 
 from filterlab.kernels import PiecewisePolynomial, differentiate, horner
+from filterlab.ops.stencil import Product, Stencil
 
 CHUNK = 1 << 15  # points at a time: temporaries stay in cache and memory does not grow with M
-
-MultiIndex = tuple[int, int, int]
-
-
-@lru_cache
-def multi_indices(order: int) -> tuple[MultiIndex, ...]:
-    """The rows of a jet."""
-    return tuple((total - j, j - k, k) for total in range(order + 1) for j in range(total + 1) for k in range(j + 1))
 
 
 def locate(x: Tensor, support: int, size: int, start: int) -> tuple[Tensor, Tensor]:
@@ -38,44 +31,68 @@ def locate(x: Tensor, support: int, size: int, start: int) -> tuple[Tensor, Tens
     return base.long() - start, shifted - base
 
 
-def tap_weights(u: Tensor, kernel: PiecewisePolynomial, order: int) -> list[list[Tensor]]:
-    """weights[m][t]: the m-th derivative of the weight of tap t, each of the shape of u."""
-    taps = kernel.taps(u.dtype, u.device)
-    return [[horner(row.unbind(0), u) for row in differentiate(taps, m).unbind(0)] for m in range(order + 1)]
+Function = tuple[PiecewisePolynomial, int]
+"""A weight function: a kernel and the order of its derivative."""
+
+Taps = dict[int, Tensor]
+"""The weight of every tap that a function has."""
 
 
-class _Stencil:
+def tap_weights(u: Tensor, function: Function, support: int) -> Taps:
+    """The weights of a kernel's taps, each of the shape of u, numbered as the middle ones of `support` taps."""
+    kernel, order = function
+    first = (support - kernel.support) // 2
+    rows = differentiate(kernel.taps(u.dtype, u.device), order)
+    return {first + t: horner(row.unbind(0), u) for t, row in enumerate(rows.unbind(0))}
+
+
+class _Located:
     """Where a chunk of points reads, and with which weights.
 
     Attributes:
         first: flat index of each point's first tap, (M,).
-        supports: taps along x, y, z.
-        wx, wy, wz: `tap_weights` along each axis.
+        wx, wy, wz: for every weight function its `Taps`.
     """
 
     def __init__(
-        self,
-        points: Tensor,
-        batch_offset: Tensor | int,
-        kernels: Sequence[PiecewisePolynomial],
-        order: int,
-        shape: Sequence[int],
-        start: int,
+        self, points: Tensor, batch_offset: Tensor | int, stencil: Stencil, shape: Sequence[int], start: int
     ) -> None:
-        self.supports = [k.support for k in kernels]
+        self.stencil = stencil
         self.strides = (1, shape[-1], shape[-1] * shape[-2])
         located = [
             locate(x, s, n, start)
-            for x, s, n in zip(points.unbind(-1), self.supports, tuple(shape)[:-4:-1], strict=True)
+            for x, s, n in zip(points.unbind(-1), stencil.supports, tuple(shape)[:-4:-1], strict=True)
         ]
         (x, _), (y, _), (z, _) = located
         self.first: Tensor = x + y * self.strides[1] + z * self.strides[2] + batch_offset
-        self.wx, self.wy, self.wz = (tap_weights(u, k, order) for (_, u), k in zip(located, kernels, strict=True))
+        self.wx, self.wy, self.wz = (self._weights(axis, u) for axis, (_, u) in enumerate(located))
 
-    def row(self, z: int, y: int) -> range:
-        """Flat offsets, from the first tap, of the taps along x in row (z, y)."""
-        start = z * self.strides[2] + y * self.strides[1]
-        return range(start, start + self.supports[0])
+    def _weights(self, axis: int, u: Tensor) -> dict[Function, Taps]:
+        functions = {(p.kernels[axis], p.orders[axis]): None for row in self.stencil.rows for p in row}
+        return {f: tap_weights(u, f, self.stencil.supports[axis]) for f in functions}
+
+    def lines(self) -> Iterator[tuple[int, int, list[tuple[Function, Function]]]]:
+        """(z, y, pairs) for every line of taps, with the distinct (a, b) of products that read it."""
+        for z in range(self.stencil.supports[2]):
+            for y in range(self.stencil.supports[1]):
+                pairs = dict.fromkeys(
+                    (a, b)
+                    for row in self.stencil.rows
+                    for _, a, b, c in map(functions_of, row)
+                    if y in self.wy[b] and z in self.wz[c]
+                )
+                if pairs:
+                    yield z, y, list(pairs)
+
+    def offset(self, z: int, y: int, x: int) -> int:
+        """Flat offset of a tap from the first one."""
+        return z * self.strides[2] + y * self.strides[1] + x
+
+
+def functions_of(product: Product) -> tuple[float, Function, Function, Function]:
+    """(weight, a, b, c)."""
+    a, b, c = zip(product.kernels, product.orders, strict=True)
+    return product.weight, a, b, c
 
 
 def _chunks(coefficient_shape: Sequence[int], points: Tensor) -> Iterator[tuple[slice, Tensor, Tensor | int]]:
@@ -89,115 +106,114 @@ def _chunks(coefficient_shape: Sequence[int], points: Tensor) -> Iterator[tuple[
         yield part, flat[part], offset
 
 
-def _gather(flat: Tensor, first: Tensor, offset: int) -> Tensor:
+def _read(flat: Tensor, first: Tensor, offset: int) -> Tensor:
     """flat[:, first + offset], (C, M): a shifted view saves index arithmetic; 1-D gathers are twice as fast as 2-D."""
     if flat.shape[0] == 1:
         return flat[0, offset:].index_select(0, first)[None]
     return flat[:, offset:].index_select(1, first)
 
 
-def _scatter(out: Tensor, first: Tensor, offset: int, values: Tensor) -> None:
-    """out[:, first + offset] += values, in place; the transpose of `_gather`."""
+def _add(out: Tensor, first: Tensor, offset: int, values: Tensor) -> None:
+    """out[:, first + offset] += values, in place; the transpose of `_read`."""
     if out.shape[0] == 1:
         out[0, offset:].scatter_add_(0, first, values[0])
     else:
         out[:, offset:].index_add_(1, first, values)
 
 
-def jet(
-    coefficients: Tensor, points: Tensor, kernels: Sequence[PiecewisePolynomial], order: int, start: int = 0
-) -> Tensor:
-    """Partial derivatives of Σ_k c_k φ_x(x−k_x) φ_y(y−k_y) φ_z(z−k_z) up to `order`.
+def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
+    """The rows of a stencil at the points.
 
     Args:
-        coefficients: (N, C, D, H, W), any real dtype; each axis at least as long as its kernel's support.
+        coefficients: (N, C, D, H, W), any real dtype; each axis at least as long as the stencil's support.
         points: (N, M, 3), x, y, z; float32 or float64.
-        kernels: one per axis x, y, z.
+        stencil: what is summed.
         start: the coordinate of coefficient 0, the same along every axis.
 
     Returns:
-        (N, C, J, M) in the dtype of the points, J = len(multi_indices(order)).
+        (N, C, J, M) in the dtype of the points.
     """
     n, c = coefficients.shape[:2]
-    rows = multi_indices(order)
     flat = coefficients.transpose(0, 1).reshape(c, n * math.prod(coefficients.shape[2:]))
     parts = []
     for _, chunk, offset in _chunks(coefficients.shape, points):
-        stencil = _Stencil(chunk, offset, kernels, order, coefficients.shape, start)
-        parts.append(_contract(flat, stencil, order, chunk.dtype))
+        parts.append(_contract(flat, _Located(chunk, offset, stencil, coefficients.shape, start), chunk.dtype))
+    rows = len(stencil.rows)
     if not parts:
-        return points.new_zeros((n, c, len(rows), points.shape[1]))
+        return points.new_zeros((n, c, rows, points.shape[1]))
     out = torch.cat(parts, -1)  # (J, C, N·M)
-    return out.reshape(len(rows), c, n, points.shape[1]).permute(2, 1, 0, 3)
+    return out.reshape(rows, c, n, points.shape[1]).permute(2, 1, 0, 3)
 
 
-def _contract(flat: Tensor, stencil: _Stencil, order: int, dtype: torch.dtype) -> Tensor:
-    """(J, C, M): taps summed along x, then y, then z (order + 1 sums along x serve every derivative in y and z)."""
-    jets: dict[MultiIndex, Tensor] = {}
-    for z in range(stencil.supports[2]):
-        planes: dict[tuple[int, int], Tensor] = {}
-        for y in range(stencil.supports[1]):
-            values = [_gather(flat, stencil.first, offset).to(dtype) for offset in stencil.row(z, y)]
-            for mx in range(order + 1):
-                line = _dot(stencil.wx[mx], values)
-                for my in range(order + 1 - mx):
-                    _accumulate(planes, (mx, my), stencil.wy[my][y], line)
-        for (mx, my), plane in planes.items():
-            for mz in range(order + 1 - mx - my):
-                _accumulate(jets, (mx, my, mz), stencil.wz[mz][z], plane)
-    return torch.stack([jets[m] for m in multi_indices(order)])
+def _contract(flat: Tensor, at: _Located, dtype: torch.dtype) -> Tensor:
+    """(J, C, M): taps summed along x, then y, then z (the sums along x serve every function along y and z)."""
+    rows: dict[int, Tensor] = {}
+    for z, lines in groupby(at.lines(), key=itemgetter(0)):
+        planes: dict[tuple[Function, Function], Tensor] = {}
+        for _, y, pairs in lines:
+            functions = dict.fromkeys(a for a, _ in pairs)
+            taps = sorted({x for a in functions for x in at.wx[a]})
+            values = {x: _read(flat, at.first, at.offset(z, y, x)).to(dtype) for x in taps}
+            sums = {a: _dot([(w, values[x]) for x, w in at.wx[a].items()]) for a in functions}
+            for a, b in pairs:
+                _accumulate(planes, (a, b), at.wy[b][y], sums[a])
+        for r, row in enumerate(at.stencil.rows):
+            for weight, a, b, c in map(functions_of, row):
+                if z in at.wz[c] and (a, b) in planes:
+                    _accumulate(rows, r, at.wz[c][z], planes[a, b], weight)
+    return torch.stack([rows[r] for r in range(len(at.stencil.rows))])
 
 
-def _dot(weights: Sequence[Tensor], values: Sequence[Tensor]) -> Tensor:
-    total = weights[0] * values[0]
-    for w, v in zip(weights[1:], values[1:], strict=True):
-        total = torch.addcmul(total, w, v)
+def _dot(terms: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    (weight, value), *others = terms
+    total = weight * value
+    for weight, value in others:
+        total = torch.addcmul(total, weight, value)
     return total
 
 
-def _accumulate(sums: dict, key: tuple[int, ...], weight: Tensor, value: Tensor) -> None:
-    sums[key] = torch.addcmul(sums[key], weight, value) if key in sums else weight * value
+def _accumulate(sums: dict, key: object, weight: Tensor, value: Tensor, factor: float = 1.0) -> None:
+    """sums[key] += factor · weight · value."""
+    if key in sums:
+        sums[key] = torch.addcmul(sums[key], weight, value, value=factor)
+    else:
+        sums[key] = weight * value if factor == 1 else factor * (weight * value)
 
 
-def splat(
-    cotangents: Tensor,
-    points: Tensor,
-    kernels: Sequence[PiecewisePolynomial],
-    order: int,
-    shape: Sequence[int],
-    start: int = 0,
-) -> Tensor:
-    """The transpose of `jet`: Σ over points and rows of cotangent · weight, scattered into a coefficient array.
+def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int], start: int = 0) -> Tensor:
+    """The transpose of `gather`: Σ over points and rows of cotangent · weight, added up in a coefficient array.
 
     Args:
-        cotangents: (N, C, J, M), as `jet` returns.
-        points, kernels, order, start: as for `jet`.
+        cotangents: (N, C, J, M), as `gather` returns.
+        points, stencil, start: as for `gather`.
         shape: (D, H, W) of the result.
 
     Returns:
-        (N, C, D, H, W) in the dtype of the points.
+        (N, C, D, H, W) in the dtype of the points. A point that is not finite adds nothing.
     """
     n, c = cotangents.shape[:2]
     full = (n, c, *shape)
     out = points.new_zeros((c, n * shape[0] * shape[1] * shape[2]))
     flat = cotangents.permute(2, 1, 0, 3).reshape(cotangents.shape[2], c, n * points.shape[1])  # (J, C, N·M)
     for part, chunk, offset in _chunks(full, points):
-        stencil = _Stencil(chunk, offset, kernels, order, full, start)
-        jets = dict(zip(multi_indices(order), flat[..., part].to(points.dtype), strict=True))
-        _spread(out, jets, stencil, order)
+        known = chunk.isfinite().all(-1)
+        own = torch.where(known, flat[..., part].to(points.dtype), 0)
+        _spread(out, own, _Located(torch.where(known[:, None], chunk, 0), offset, stencil, full, start))
     return out.reshape(c, n, *shape).transpose(0, 1)
 
 
-def _spread(out: Tensor, jets: dict[MultiIndex, Tensor], stencil: _Stencil, order: int) -> None:
-    """The three sums of `_contract` run backwards, in place on `out` (C, N·V)."""
-    for z in range(stencil.supports[2]):
-        planes: dict[tuple[int, int], Tensor] = {}
-        for (mx, my, mz), cotangent in jets.items():
-            _accumulate(planes, (mx, my), stencil.wz[mz][z], cotangent)
-        for y in range(stencil.supports[1]):
-            lines: dict[tuple[int], Tensor] = {}
-            for (mx, my), plane in planes.items():
-                _accumulate(lines, (mx,), stencil.wy[my][y], plane)
-            for x, offset in enumerate(stencil.row(z, y)):
-                value = _dot([stencil.wx[mx][x] for mx in range(order + 1)], [lines[mx,] for mx in range(order + 1)])
-                _scatter(out, stencil.first, offset, value)
+def _spread(out: Tensor, cotangents: Tensor, at: _Located) -> None:
+    """The three sums of `_contract` run backwards, in place on `out` (C, N·V); cotangents (J, C, M)."""
+    for z, lines in groupby(at.lines(), key=itemgetter(0)):
+        planes: dict[tuple[Function, Function], Tensor] = {}
+        for row, cotangent in zip(at.stencil.rows, cotangents, strict=True):
+            for weight, a, b, c in map(functions_of, row):
+                if z in at.wz[c]:
+                    _accumulate(planes, (a, b), at.wz[c][z], cotangent, weight)
+        for _, y, pairs in lines:
+            sums: dict[Function, Tensor] = {}
+            for a, b in pairs:
+                _accumulate(sums, a, at.wy[b][y], planes[a, b])
+            for x in sorted({x for a in sums for x in at.wx[a]}):
+                terms = [(at.wx[a][x], line) for a, line in sums.items() if x in at.wx[a]]
+                _add(out, at.first, at.offset(z, y, x), _dot(terms))

@@ -1,12 +1,12 @@
-"""Direct volume rendering of any Field: emission and absorption along rays, in plain torch.
+"""Direct volume rendering of any Field: emission and absorption along rays.
 
     rays ─▶ (t_near, t_far) ─▶ samples ─▶ transfer function ─▶ shading ─▶ compositing
 
-Letters: R rays, K samples of each ray in a block, S = samples of a block that exist (no more than R K), s the length of
-a segment, τ its optical depth, T transmittance. Geometry (rays, distances) is float64; samples are `dtype`.
+What is done here: cameras and rays, and where rays enter and leave the field; tiles of rays; the background. Along the
+rays goes a *marcher*: the fused one (`render.fused`, vector code) for fields whose scheme is "fused", where it can run
+as asked, else the plain one (`render.plain`, torch) for any field. The image does not depend on which.
 
-How work is cut up never changes a number: blocks have K consecutive segments of a ray wherever the tile's edge is, sums
-over them have a fixed order, and jitter is a hash of the pixel number.
+How work is cut up never changes a number: every ray is marched for itself, and jitter is a hash of the pixel number.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import SupportsFloat
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from filterlab.fields.base import Field
+from filterlab.fields.base import Domain, Field
 from filterlab.fields.grid import GridField
 from filterlab.render.camera import Camera, check_size
-from filterlab.render.rays import Region, check_rays, check_region, intersect, jitter, segment_count, segments
+from filterlab.render.fused import FusedMarcher, can_be_fused
+from filterlab.render.plain import Chords, Marcher, Medium, PlainMarcher, rays_at_once
+from filterlab.render.rays import Region, check_rays, check_region, intersect, jitter, segment_count
 from filterlab.render.shading import Shading
 from filterlab.render.transfer import TransferFunction
 
 Rays = tuple[Tensor, Tensor]
 Progress = bool | None | Callable[[int, int], None]
 
-BLOCK = 32  # K, consecutive segments of a ray that are composited together; a power of two
-_FLOATS_PER_SAMPLE = 160  # what a field of 27 taps and the marcher hold at a time, measured
-_FLOATS_PER_SAMPLE_SAVED = 1000  # the same while autograd records them
+_TILE = 1 << 16  # rays that are cut at a time; more would only leave the caches
 _BYTES_PER_RAY = 256
-_LARGEST_BLOCK = 2**18  # samples; more would only leave the caches
+_BYTES_PER_RAY_SAVED = 2048  # of the fused marcher while autograd records
 
 
 def render(
@@ -93,7 +93,8 @@ def render(
         field gives `(N, C, H, W, 4)` (or `(N, C, ..., 4)`), each image with the bits that its own volume would give.
 
         Differentiable (twice) in whatever the field was built from, camera pose or rays, transfer function, shading and
-        background. Blocks of samples are recomputed in the backward pass, so that memory stays bounded then too.
+        background. Samples are recomputed in the backward pass, so that memory stays bounded then too; where the march
+        is fused it does not grow with the number of steps at all.
 
         Differentiate with torch.autograd: the transforms `torch.func.grad`, `vjp` and `vmap` of `render` itself are not
         supported and raise torch's own RuntimeError. The first two do not allow the recomputation (it saves tensors
@@ -122,32 +123,38 @@ def render(
     )
     brightest = transfer.brightest if shading is None else shading.brightest(transfer.brightest)
     brightest = max(brightest, float(color.detach().max()), 1.0)
-    marcher = _Marcher(
-        field=field,
-        transfer=transfer.to(dtype, device),
-        shading=shading,
-        step=step * field.domain.voxel_size,
-        region=box,
-        jitter_seed=jitter_seed,
-        faint=0.0 if termination is None or differentiable else termination / brightest,
-        dtype=dtype,
-        differentiable=differentiable,
-        rays_at_once=_rays_at_once(memory, dtype, differentiable),
-    )
-    tile = marcher.rays_at_once if differentiable else max(marcher.rays_at_once, memory // (4 * _BYTES_PER_RAY))
-    fields = _unbatched(field)
+    transfer = transfer.to(dtype, device)
+    faint = 0.0 if termination is None or differentiable else termination / brightest
+    length = step * field.domain.voxel_size
+    media = [Medium(one, transfer, shading, length, faint, differentiable) for one in _unbatched(field)]
+    cut = _Cut(field.domain, box, length, jitter_seed, differentiable)
+    marcher, tile = _marcher(media[0], memory)
     with torch.set_grad_enabled(differentiable):
-        total = marcher.count(view, tile, len(fields), max_samples)
+        parts: Sequence[Tensor | Chords] = view.pixels.split(tile)
+        if len(view.pixels) * _BYTES_PER_RAY <= memory:  # else rays are cut again for every image
+            parts = [cut(view, pixels) for pixels in parts]
+        total = cut.count_all(view, parts, len(media), max_samples)
         with _reporting(progress, total) as report:
             done, tiles = 0, []
-            for one in fields:
-                marcher = replace(marcher, field=one)
-                for pixels in view.pixels.split(tile):
-                    emitted, depth = marcher.march(view, pixels, lambda n, done=done: report(done + n))
-                    done += marcher.samples_done
-                    tiles.append(_over(emitted, depth[:, None], color))
+            for medium in media:
+                for part in parts:
+                    chords = part if isinstance(part, Chords) else cut(view, part)
+                    light, depth = marcher.march(medium, chords, lambda n, done=done: report(done + n))
+                    done += int(chords.count.sum())  # with those that early termination saved
+                    tiles.append(_over(light, depth[:, None], color))
             report(total)
     return torch.cat(tiles).reshape(*(field.channels or ()), *view.shape, 4)
+
+
+def _marcher(medium: Medium, memory: int) -> tuple[Marcher, int]:
+    """The fused marcher where it can run as asked, else the plain one; and how many rays go to it at a time."""
+    if can_be_fused(medium):
+        if medium.differentiable:  # derivatives by the volume are a volume for every tile
+            return FusedMarcher(memory), max(memory // _BYTES_PER_RAY_SAVED, 1)
+        return FusedMarcher(memory), max(min(memory // _BYTES_PER_RAY, _TILE), 1)
+    at_once = rays_at_once(memory, medium.dtype, medium.differentiable)
+    tile = at_once if medium.differentiable else max(at_once, memory // (4 * _BYTES_PER_RAY))
+    return PlainMarcher(memory), tile
 
 
 def _unbatched(field: Field) -> list[Field]:
@@ -196,31 +203,31 @@ class _View:
         return cls(tuple(origins.shape[:-1]), pixels, lambda p: (o[p], d[p]), requires_grad)
 
 
-@dataclass
-class _Marcher:
-    """Marches tiles of rays through a field; all lengths are world lengths here."""
+@dataclass(frozen=True)
+class _Cut:
+    """Cuts rays to a field's domain and into segments; all lengths are world lengths."""
 
-    field: Field
-    transfer: TransferFunction
-    shading: Shading | None
-    step: float
+    domain: Domain
     region: Region | None
+    step: float
     jitter_seed: int | None
-    faint: float  # transmittance below which a ray ends; 0: only at exactly 0
-    dtype: torch.dtype
     differentiable: bool
-    rays_at_once: int
-    samples_done: int = 0
 
-    def __post_init__(self) -> None:
-        # gradients come in one pass with values when nearly every sample needs one: when derivatives are asked, or
-        # when no value is transparent
-        self.one_pass = self.shading is not None and (self.differentiable or not self.transfer.transparent_somewhere)
+    def __call__(self, view: _View, pixels: Tensor) -> Chords:
+        """The parts inside of the rays of `pixels` `(R,)`."""
+        if self.differentiable:
+            entry, direction, length = checkpoint(self.inside, view, pixels, use_reentrant=False)  # type: ignore[misc]
+        else:
+            entry, direction, length = self.inside(view, pixels)
+        offset = self.offset(pixels)
+        return Chords(
+            entry, direction, length, offset, segment_count(length, self.step, offset).clamp_max(2.0**62).long()
+        )
 
     def inside(self, view: _View, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where the rays of `pixels` `(R,)` enter the domain `(R, 3)`, their directions and lengths inside `(R,)`."""
+        """Where rays enter the domain `(R, 3)`, their directions and lengths inside `(R,)`."""
         origins, directions = view.rays(pixels)
-        near, far = intersect(origins, directions, self.field.domain, self.region)
+        near, far = intersect(origins, directions, self.domain, self.region)
         hit = far.detach() > near.detach()
         length = torch.where(hit, far - near, torch.zeros_like(far))
         near = torch.where(hit, near, torch.zeros_like(near))
@@ -233,11 +240,14 @@ class _Marcher:
         return jitter(self.jitter_seed, pixels)
 
     @torch.no_grad()
-    def count(self, view: _View, tile: int, images: int, limit: int) -> int:
-        """How many samples the images take. Raises ValueError above `limit`."""
+    def count_all(self, view: _View, parts: Sequence[Tensor | Chords], images: int, limit: int) -> int:
+        """How many samples the images take; parts of them are pixels or rays. Raises ValueError above `limit`."""
         total = 0.0
-        for pixels in view.pixels.split(tile):
-            total += float(segment_count(self.inside(view, pixels)[2], self.step, self.offset(pixels)).sum())
+        for part in parts:
+            if isinstance(part, Chords):
+                total += float(part.count.double().sum())
+            else:
+                total += float(segment_count(self.inside(view, part)[2], self.step, self.offset(part)).sum())
         total *= images
         if not total <= limit:
             raise ValueError(
@@ -246,125 +256,11 @@ class _Marcher:
             )
         return int(total)
 
-    def march(self, view: _View, pixels: Tensor, report: Callable[[int], None]) -> tuple[Tensor, Tensor]:
-        """Emitted light `(R, 3)` and optical depth `(R,)` of the rays through `pixels`, float64."""
-        if self.differentiable:
-            entry, direction, length = checkpoint(self.inside, view, pixels, use_reentrant=False)  # type: ignore[misc]
-        else:
-            entry, direction, length = self.inside(view, pixels)
-        offset = self.offset(pixels)
-        count = segment_count(length, self.step, offset).long()
-        light = torch.zeros_like(entry)
-        depth = torch.zeros_like(length)
-        alive = (count > 0).nonzero()[:, 0]
-        first, self.samples_done = 0, 0
-        while len(alive):
-            for rays in alive.split(self.rays_at_once):
-                block = (entry[rays], direction[rays], length[rays], offset[rays], count[rays], depth[rays], first)
-                if self.differentiable:
-                    more, after = checkpoint(self.block, *block, use_reentrant=False, preserve_rng_state=False)  # type: ignore[misc]
-                    light, depth = light.index_add(0, rays, more), depth.index_copy(0, rays, after)
-                else:
-                    more, after = self.block(*block)
-                    light.index_add_(0, rays, more)
-                    depth.index_copy_(0, rays, after)
-                self.samples_done += int((count[rays] - first).clamp_max(BLOCK).sum())
-                report(self.samples_done)
-            first += BLOCK
-            alive = alive[self._goes_on(count[alive], depth[alive].detach(), first)]
-        self.samples_done = int(count.sum())  # those that early termination saved count as done
-        return light, depth
-
-    def _goes_on(self, count: Tensor, depth: Tensor, first: int) -> Tensor:
-        if self.differentiable:
-            return count > first
-        transmittance = torch.exp(-depth)
-        return (count > first) & ~((transmittance < self.faint) | (transmittance == 0))  # NaN goes on
-
-    def block(
-        self,
-        entry: Tensor,
-        direction: Tensor,
-        length: Tensor,
-        offset: Tensor,
-        count: Tensor,
-        depth: Tensor,
-        first: int,
-    ) -> tuple[Tensor, Tensor]:
-        """What K segments of every ray add to its light `(R, 3)`, and its optical depth behind them `(R,)`."""
-        middle, thickness = segments(length, self.step, first, BLOCK, offset)
-        real = torch.arange(first, first + BLOCK, device=count.device) < count[:, None]  # (R, K)
-        kept = None if bool(real.all()) else real.reshape(-1).nonzero()[:, 0]
-        direction = direction.to(self.dtype)
-        middle = middle.to(self.dtype)[..., None]
-        points = torch.addcmul(entry.to(self.dtype)[:, None], middle, direction[:, None])  # (R, K, 3)
-        points = _pick(points.reshape(-1, 3), kept)  # (S, 3)
-        thickness = _pick(thickness.to(self.dtype).reshape(-1), kept)
-
-        jet = self.field.jet(points, 1 if self.one_pass else 0)
-        located = self.transfer.locate(jet[0])
-        tau = self.transfer.optical_depth(self.transfer.opacity(located), thickness)
-        weight, after = _compose(_spread(tau, kept, real.shape), depth, self.faint)
-
-        weight = _pick(weight.reshape(-1), kept)
-        seen = None if self.differentiable else (weight != 0).nonzero()[:, 0]
-        place = kept if seen is None else seen if kept is None else kept[seen]  # among all R K, of what is seen
-        color = self.transfer.color(located if seen is None else located.at(seen))
-        if self.shading is not None:
-            gradient = _pick(jet[1], seen) if self.one_pass else self._gradient(_pick(points, seen))
-            ray = (torch.arange(real.numel(), device=count.device) if place is None else place) // BLOCK
-            color = self.shading(color, gradient, direction.index_select(0, ray))
-        emitted = _pick(weight, seen)[:, None] * color
-        return _sum_pairwise(_spread(emitted, place, real.shape)).double(), after
-
-    def _gradient(self, points: Tensor) -> Tensor:
-        return self.field.jet(points, 1)[1] if len(points) else torch.zeros_like(points)
-
-
-def _compose(tau: Tensor, depth: Tensor, faint: float) -> tuple[Tensor, Tensor]:
-    """Weights T_i (1 − e^{−τ_i}) `(R, K)` of segments behind an optical depth `(R,)`, and the depth behind them.
-
-    Segments where less than `faint` of the light still passes get weight 0.
-    """
-    sums = tau.cumsum(-1)
-    before = torch.cat((torch.zeros_like(sums[:, :1]), sums[:, :-1]), -1) + depth.to(tau.dtype)[:, None]  # never ∞ − ∞
-    transmittance = torch.exp(-before)
-    weight = transmittance * -torch.expm1(-tau)
-    if faint > 0:
-        weight = torch.where(transmittance < faint, torch.zeros_like(weight), weight)
-    return weight, depth + sums[:, -1].double()
-
 
 def _over(light: Tensor, depth: Tensor, background: Tensor) -> Tensor:
     """Emitted light `(R, 3)` of rays of optical depth `(R, 1)` over a background `(3,)`: RGB and opacity `(R, 4)`."""
     rgb = light + torch.exp(-depth) * background
     return torch.cat((rgb, -torch.expm1(-depth)), -1).to(background.dtype)
-
-
-def _pick(x: Tensor, index: Tensor | None) -> Tensor:
-    """Rows of x; all of them for None."""
-    return x if index is None else x.index_select(0, index)
-
-
-def _spread(x: Tensor, index: Tensor | None, shape: Sequence[int]) -> Tensor:
-    """Rows put back where `_pick` took them from, zeros elsewhere: `(S, *)` to `(*shape, *)`."""
-    if index is not None:
-        x = x.new_zeros((math.prod(shape), *x.shape[1:])).index_copy(0, index, x)
-    return x.reshape(*shape, *x.shape[1:])
-
-
-def _sum_pairwise(x: Tensor) -> Tensor:
-    """Σ over axis 1 of `(R, K, 3)`, K a power of two, in one fixed order."""
-    while x.shape[1] > 1:
-        half = x.shape[1] // 2
-        x = x[:, :half] + x[:, half:]
-    return x[:, 0]
-
-
-def _rays_at_once(memory: int, dtype: torch.dtype, differentiable: bool) -> int:
-    floats = _FLOATS_PER_SAMPLE_SAVED if differentiable else _FLOATS_PER_SAMPLE
-    samples = min(memory * 3 // 4 // (floats * dtype.itemsize), _LARGEST_BLOCK)
-    return max(samples // BLOCK, 1)
 
 
 def _check_arguments(

@@ -69,16 +69,21 @@ def slab(origins: Tensor, directions: Tensor, lower: Sequence[float], upper: Seq
 
     Source: Kay & Kajiya, Ray tracing complex scenes, 1986.
     """
-    low, high = origins.new_tensor(list(lower)), origins.new_tensor(list(upper))
-    still = directions.abs() < _NO_MOTION
-    inside = (origins >= low) & (origins <= high)
-    speed = torch.where(still, torch.ones_like(directions), directions)
-    a, b = (low - origins) / speed, (high - origins) / speed
-    everything = torch.full_like(a, torch.inf)
-    empty = torch.where(inside, -everything, everything)  # t_near of an axis without motion; t_far is its negative
-    near = torch.where(still, empty, torch.minimum(a, b))
-    far = torch.where(still, -empty, torch.maximum(a, b))
-    return near.amax(-1), far.amin(-1)
+    axes = [_slab(origins[..., d], directions[..., d], lower[d], upper[d]) for d in range(3)]  # whole triples are slow
+    (near, far), *others = axes
+    for other_near, other_far in others:
+        near, far = torch.maximum(near, other_near), torch.minimum(far, other_far)
+    return near, far
+
+
+def _slab(origin: Tensor, direction: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
+    """The same of one axis."""
+    still = direction.abs() < _NO_MOTION
+    inside = (origin >= low) & (origin <= high)
+    speed = torch.where(still, 1.0, direction)
+    a, b = (low - origin) / speed, (high - origin) / speed
+    empty = torch.where(inside, -torch.inf, torch.inf).to(direction.dtype)  # t_near without motion; t_far is −t_near
+    return torch.where(still, empty, torch.minimum(a, b)), torch.where(still, -empty, torch.maximum(a, b))
 
 
 def intersect(

@@ -9,8 +9,11 @@ import torch
 from torch import Tensor
 
 from filterlab import ops
+from filterlab.fields.ncrsi import NCRSI_TERMS
+from filterlab.fields.tensor_product import Direct, same_kernel
 from filterlab.kernels import CATMULL_ROM, CENTRAL_DIFFERENCE, KERNELS, LINEAR, TensorKernel, bspline
-from filterlab.ops import cpu, reference
+from filterlab.ops import Product, Stencil, autograd, cpu, reference
+from filterlab.ops.cpu import order
 from tests.laws import assert_close
 
 SHAPE = (9, 8, 7)
@@ -49,12 +52,12 @@ def assert_same(actual: Tensor, expected: Tensor) -> None:
 def assert_jet_and_splat_agree(kernels, order: int, dtype: torch.dtype, n=2, c=2, m=45) -> None:
     points = some_points(n, m, dtype)
     coefficients = torch.randn((n, c, *SHAPE), dtype=dtype)
-    expected = reference.jet(coefficients, points, kernels, order, START)
+    expected = ops.jet(coefficients, points, kernels, order, START)
     assert_same(ops.jet(coefficients, points, kernels, order, START, "cpu"), expected)
     cotangents = torch.randn_like(expected)
     assert_same(
         ops.splat(cotangents, points, kernels, order, SHAPE, START, "cpu"),
-        reference.splat(cotangents, points, kernels, order, SHAPE, START),
+        ops.splat(cotangents, points, kernels, order, SHAPE, START),
     )
 
 
@@ -68,6 +71,64 @@ def test_equals_the_reference(name: str, order: int, dtype: torch.dtype) -> None
 @pytest.mark.parametrize("name", MIXED)
 def test_a_kernel_per_axis(name: str, order: int, dtype: torch.dtype) -> None:
     assert_jet_and_splat_agree(MIXED[name], order, dtype)
+
+
+SUMS = {
+    "ncrsi, central": Direct(NCRSI_TERMS, "fused", "central").stencils[1],
+    "ncrsi, analytic": Direct(NCRSI_TERMS, "fused").stencils[2],
+    "trilinear, central": Direct(same_kernel(LINEAR), "fused", "central").stencils[1],
+    "holes": Stencil(
+        (
+            (Product((CENTRAL_DIFFERENCE, LINEAR, CATMULL_ROM), (0, 1, 2), -0.5), Product((LINEAR,) * 3, (2, 0, 0))),
+            (Product((LINEAR, CATMULL_ROM, LINEAR), (1, 2, 0)), Product((LINEAR, CATMULL_ROM, LINEAR), (1, 2, 0), 2.0)),
+            (Product((LINEAR,) * 3, (2, 0, 0)),),
+        )
+    ),
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", SUMS)
+def test_sums_of_products(name: str, dtype: torch.dtype) -> None:
+    stencil = SUMS[name]
+    for s in (stencil, stencil.derivatives[0]):
+        if s.order > cpu.MAX_ORDER:
+            continue
+        points, coefficients = some_points(2, 45, dtype), torch.randn((2, 2, *SHAPE), dtype=dtype)
+        expected = ops.gather(coefficients, points, s, START)
+        assert_same(ops.gather(coefficients, points, s, START, "cpu"), expected)
+        cotangents = torch.randn_like(expected)
+        spread = ops.scatter(cotangents, points, s, SHAPE, START)
+        assert_same(ops.scatter(cotangents, points, s, SHAPE, START, "cpu"), spread)
+        assert_close((spread * coefficients).sum(), (cotangents * expected).sum(), TOLERANCE[dtype] * 1e3)
+
+
+def test_a_sum_of_products_is_the_sum_of_their_jets() -> None:
+    """The reference against itself, term by term; inside, as a wider support extrapolates from elsewhere."""
+    points, coefficients = torch.rand(1, 45, 3).double() * 4 - 1, torch.randn((1, 1, *SHAPE), dtype=torch.float64)
+    for row, total in enumerate(ops.gather(coefficients, points, SUMS["ncrsi, analytic"], START).unbind(2)):
+        orders = ops.multi_indices(2)[row]
+        terms = [
+            t.weight * ops.jet(coefficients, points, t.kernels, 2, START)[:, :, ops.multi_indices(2).index(orders)]
+            for t in NCRSI_TERMS
+        ]
+        assert_close(total, torch.stack(terms).sum(0), 1e-13, 10)
+
+
+def test_ncrsi_reads_32_coefficients() -> None:
+    """Its 4×4×4 block has 32 corners and edges without a weight; what stands there does not matter, NaN included."""
+    stencil, points = SUMS["ncrsi, central"], torch.full((1, 8, 3), 1.5, dtype=torch.float64)
+    read = ops.scatter(torch.randn(1, 1, 4, 8, dtype=torch.float64), points, stencil, (4, 4, 4), 0, "cpu") != 0
+    assert int(read.sum()) == 32
+    coefficients = torch.where(read, torch.randn(1, 1, 4, 4, 4, dtype=torch.float64), torch.nan)
+    assert ops.gather(coefficients, points, stencil, 0, "cpu").isfinite().all()
+
+
+def test_supports_of_both_parities_do_not_mix() -> None:
+    with pytest.raises(
+        ValueError, match=r"supports along y must all be even or all be odd; got bspline2 \(3\), linear \(2\)"
+    ):
+        Stencil(((Product((LINEAR, bspline(2), LINEAR)),), (Product((LINEAR,) * 3),)))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -84,7 +145,7 @@ def test_coefficients_are_converted_when_read(dtype: torch.dtype, stored: torch.
     values = torch.randn((1, 1, *SHAPE)) * 60
     coefficients = (values.abs() if stored == torch.uint8 else values).to(stored)
     points = some_points(1, 20, dtype)
-    expected = reference.jet(coefficients, points, kernels, 0, START)
+    expected = ops.jet(coefficients, points, kernels, 0, START)
     assert_same(ops.jet(coefficients, points, kernels, 0, START, "cpu"), expected)
 
 
@@ -109,16 +170,16 @@ def test_views_are_read_in_place_or_copied_never_misread() -> None:
         "negated lazily": torch._neg_view(base),
     }
     for name, view in views.items():
-        expected = reference.jet(view, points, (bspline(2),) * 3, 1, START)
+        expected = ops.jet(view, points, (bspline(2),) * 3, 1, START)
         assert torch.allclose(ops.jet(view, points, bspline(2), 1, START, "cpu"), expected, atol=1e-12), name
     shared = points[:1].expand(2, -1, -1)
     strided = torch.randn(2, 11, 6, dtype=torch.float64)[..., ::2]
     for p in (shared, strided):
-        expected = reference.jet(base, p, (bspline(2),) * 3, 1, START)
+        expected = ops.jet(base, p, (bspline(2),) * 3, 1, START)
         assert_same(ops.jet(base, p, bspline(2), 1, START, "cpu"), expected)
         cotangents = torch.randn_like(expected).transpose(2, 3).contiguous().transpose(2, 3)
         spread = ops.splat(cotangents, p, bspline(2), 1, SHAPE, START, "cpu")
-        assert_same(spread, reference.splat(cotangents, p, (bspline(2),) * 3, 1, SHAPE, START))
+        assert_same(spread, ops.splat(cotangents, p, (bspline(2),) * 3, 1, SHAPE, START))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -136,12 +197,47 @@ def test_nan_and_infinite_points_give_nan_and_leave_their_neighbours_alone(name:
         assert torch.equal(jet[..., others], clean[..., others])
 
 
+@pytest.mark.parametrize("sorting", [False, True])
+@pytest.mark.parametrize("m", [16, 17, 45])  # sorting needs a pack of points: 16 floats with AVX-512
+@pytest.mark.parametrize("name", ["quadratic", "ncrsi, central", "trilinear, central"])
+def test_pull_is_the_adjoint_to_the_points(name: str, m: int, sorting: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(order, "pays", lambda *_: sorting)
+    stencil = SUMS.get(name) or Stencil.jet(bspline(2), 1)
+    for dtype in (torch.float32, torch.float64):
+        if stencil.order >= cpu.MAX_ORDER:
+            continue
+        coefficients, points = torch.randn(2, 3, *SHAPE, dtype=dtype), some_points(2, m, dtype)
+        cotangents = torch.randn(2, 3, len(stencil.rows), m, dtype=dtype)
+        raised = ops.gather(coefficients, points, stencil.derivatives[0], START)
+        expected = autograd.gradient_to_points(raised, cotangents, stencil)
+        assert_same(cpu.pull(coefficients, points, cotangents, stencil, START), expected)
+    assert cpu.pull(coefficients, points[:, :0], cotangents[..., :0], stencil, START).shape == (2, 0, 3)
+
+
+@pytest.mark.parametrize("implementation", ["reference", "cpu"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nan_and_infinite_points_add_nothing(dtype: torch.dtype, implementation: str) -> None:
+    for i, bad in enumerate((float("nan"), float("inf"), -float("inf"))):
+        points, keep = some_points(1, 16, dtype), torch.arange(16) != 5
+        points[0, 5, i] = bad
+        coefficients = torch.randn(1, 1, *SHAPE, dtype=dtype, requires_grad=True)
+        at = points.clone().requires_grad_()
+        ops.jet(coefficients, at, bspline(2), 1, START, implementation).sum().backward()
+        others = torch.ones(1, 1, 4, 15, dtype=dtype)
+        expected = ops.splat(others, points[:, keep], bspline(2), 1, SHAPE, START)
+        assert coefficients.grad is not None
+        assert at.grad is not None
+        assert_same(coefficients.grad, expected)
+        assert at.grad[0, 5].isnan().all()
+        assert at.grad[0, keep].isfinite().all()
+
+
 @pytest.mark.parametrize("far", [100.0, 1e4, -1e4])
 def test_far_points_are_extrapolated_like_the_reference(far: float) -> None:
     coefficients = torch.randn((1, 1, *SHAPE), dtype=torch.float64)
     points = torch.full((1, 3, 3), far, dtype=torch.float64)
     points[0, 1, 0] = points[0, 2, 1] = 3.25
-    expected = reference.jet(coefficients, points, (bspline(2),) * 3, 1, START)
+    expected = ops.jet(coefficients, points, (bspline(2),) * 3, 1, START)
     actual = ops.jet(coefficients, points, bspline(2), 1, START, "cpu")
     assert torch.allclose(actual, expected, rtol=1e-12, atol=0)
 
@@ -201,7 +297,7 @@ def test_derivatives_beyond_the_fused_orders() -> None:
 
 def test_derivatives_stay_in_the_implementation(monkeypatch: pytest.MonkeyPatch) -> None:
     jet, at, splat, spread_at = _differentiable(1)
-    for name in ("jet", "splat"):
+    for name in ("gather", "scatter"):
         monkeypatch.setattr(reference, name, lambda *a, **k: pytest.fail("the reference was asked"))
     for function, inputs in ((jet, at), (splat, spread_at)):
         first = torch.autograd.grad(function(*inputs).square().sum(), inputs, create_graph=True)
@@ -248,7 +344,7 @@ def test_jet_does_not_depend_on_the_number_of_threads(threads) -> None:
 def test_splat_repeats_itself_and_agrees_between_numbers_of_threads(threads) -> None:
     points = some_points(2, 30_001, torch.float32)
     cotangents = torch.randn(2, 2, 4, 30_001)
-    expected = reference.splat(cotangents.double(), points.double(), (bspline(2),) * 3, 1, SHAPE, START)
+    expected = ops.splat(cotangents.double(), points.double(), (bspline(2),) * 3, 1, SHAPE, START)
     for count in (1, 2, 3):
         threads(count)
         first = ops.splat(cotangents, points, bspline(2), 1, SHAPE, START, "cpu")
@@ -286,24 +382,23 @@ def test_callers_on_several_threads_do_not_disturb_each_other(threads) -> None:
 
 def test_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     c, p, k = torch.zeros(1, 1, *SHAPE), torch.zeros(1, 4, 3), bspline(2)
-    assert cpu.missing(c, p, (k, k, k), 3) is None
-    table = TensorKernel("fitted", k.table())
-    seven = bspline(6)
+    value, seven = Stencil.jet(k, 0), bspline(6)
+    assert cpu.missing(c, p, Stencil.jet(k, 3)) is None
     for reason, arguments in {
-        "tensors of the CPU; got meta": (c.to("meta"), p, (k, k, k), 0),
-        "points must be float32 or float64; got torch.float16": (c, p.half(), (k, k, k), 0),
-        "got torch.int64": (c.long(), p, (k, k, k), 0),
-        "fixed tables; got Kernel, TensorKernel, Kernel": (c, p, (k, table, k), 0),
-        "supports go up to 6; got 3, 7, 3": (c, p, (k, seven, k), 0),
-        "orders go up to 3; got 4": (c, p, (k, k, k), 4),
-        "indices along an axis must stay below 16777216": (c, p, (k, k, k), 0, None, -(1 << 24)),
+        "tensors of the CPU; got meta": (c.to("meta"), p, value),
+        "points must be float32 or float64; got torch.float16": (c, p.half(), value),
+        "got torch.int64": (c.long(), p, value),
+        "fixed tables; got a TensorKernel": (c, p, Stencil.jet((k, TensorKernel("fitted", k.table()), k), 0)),
+        "supports go up to 6; got 3, 7, 3": (c, p, Stencil.jet((k, seven, k), 0)),
+        "orders go up to 3; got 4": (c, p, Stencil.jet(k, 4)),
+        "indices along an axis must stay below 16777216": (c, p, value, None, -(1 << 24)),
     }.items():
         assert reason in (cpu.missing(*arguments) or "nothing"), reason
     with pytest.raises(ValueError, match=r"implementation 'cpu' can't run here: orders go up to 3; got 4; impl.*'ref"):
         ops.jet(c, p, k, 4, implementation="cpu")
     with pytest.raises(ValueError, match="can't run here: supports"):
         ops.splat(torch.zeros(1, 1, 1, 4), p, seven, 0, SHAPE, implementation="cpu")
-    with pytest.raises(ValueError, match="implementation must be one of reference, cpu; got 'gpu'"):
+    with pytest.raises(ValueError, match="implementation must be one of reference, cpu, cuda; got 'gpu'"):
         ops.jet(c, p, k, implementation="gpu")
     monkeypatch.setattr(cpu, "_llvmlite_problem", lambda: "the package llvmlite can't be loaded")
     with pytest.raises(ValueError, match="llvmlite"):

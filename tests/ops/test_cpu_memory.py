@@ -14,8 +14,10 @@ import pytest
 CHECK = r'''
 import ctypes, itertools, mmap
 import torch
+from filterlab.fields.ncrsi import NCRSI_TERMS
+from filterlab.fields.tensor_product import Direct
 from filterlab.kernels import CATMULL_ROM, LINEAR, bspline
-from filterlab.ops import cpu, multi_indices, reference
+from filterlab.ops import Stencil, cpu, gather
 
 PAGE = mmap.PAGESIZE
 libc = ctypes.CDLL(None, use_errno=True)
@@ -38,12 +40,14 @@ def guarded(tensor, at_end):
 torch.manual_seed(0)
 wild = torch.tensor([0.0, -0.0, 1e30, -1e30, float("inf"), -float("inf"), float("nan"), 3e9, -3e9, 1e10, 2**31, -2**31,
                      2**24, 6.5, 1e-45])
+jets = [(LINEAR,) * 3, (bspline(2),) * 3, (bspline(5),) * 3, (bspline(0), CATMULL_ROM, bspline(4))]
+ncrsi = [Direct(NCRSI_TERMS, "fused", gradient).stencils[1] for gradient in ("central", "analytic")]
 cases = itertools.product(
-    [(LINEAR,) * 3, (bspline(2),) * 3, (bspline(5),) * 3, (bspline(0), CATMULL_ROM, bspline(4))],
+    [Stencil.jet(kernels, 1) for kernels in jets] + ncrsi,
     [(torch.float32, torch.float32), (torch.float64, torch.float64), (torch.float32, torch.uint8)],
 )
-for kernels, (dtype, stored) in cases:
-    shape = tuple(k.support + 1 for k in kernels[::-1])
+for stencil, (dtype, stored) in cases:
+    shape = tuple(support + 1 for support in stencil.supports[::-1])
     for at_end in (True, False):
         for m in (1, 3, 8, 13):
             points = torch.rand(2, m, 3, dtype=dtype) * 12 - 3
@@ -52,12 +56,16 @@ for kernels, (dtype, stored) in cases:
             points = guarded(points, at_end)
             coefficients = guarded((torch.rand(2, 2, *shape) * 100).to(stored), at_end)
             rows = guarded(torch.full((2, 2, 4, m), 7, dtype=dtype), at_end)
-            cpu._run("jet", [coefficients], points, rows, kernels, 1, 0)
-            expected = reference.jet(coefficients, points, kernels, 1, 0)
+            cpu._run("gather", [coefficients], points, rows, stencil, 0)
+            expected = gather(coefficients, points, stencil)
             fine = ((points > -50) & (points < 50)).all(-1)[:, None, None].expand_as(rows)
             assert torch.allclose(rows[fine], expected[fine], rtol=1e-3, atol=1e-2 * float(expected[fine].abs().sum()))
+            derivatives, raised = stencil.derivatives
+            if derivatives.order <= cpu.MAX_ORDER:
+                gradient = guarded(torch.full((2, m, 3), 7, dtype=dtype), at_end)
+                cpu._run("pull", [coefficients], points, rows, derivatives, 0, raised, gradient)
             if stored == dtype:
-                cpu._run("splat", [coefficients], points, rows, kernels, 1, 0)
+                cpu._run("scatter", [coefficients], points, rows, stencil, 0)
 print("nothing outside was touched")
 '''
 

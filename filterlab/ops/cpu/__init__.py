@@ -1,19 +1,22 @@
-"""jet and splat as vector code for this processor, compiled at their first use.
+"""gather and scatter as vector code for this processor, compiled at their first use.
 
-    kernels ──▶ recipe ──generator──▶ LLVM IR ──compiler──▶ machine code ──▶ cache (disk)
-                                                                 │
-    tensors ──▶ job ─────────────────────────────threads─────────┴──▶ result
+    stencil ──▶ recipe ──generate──▶ LLVM IR ──compiler──▶ machine code ──▶ cache (disk)
+                                                                │
+    tensors ──▶ job ────────────────────────────threads─────────┴──▶ result
 
-`generator` writes the program (read it first, its head explains how it computes), `lanes` the single instructions;
-`job` is what a program is told about the arrays; `compiler` and `cache` make and keep machine code; `threads` runs it.
+`taps` writes the sums (read it first, its head explains how they are computed), `lanes` the single instructions,
+`points` the program around them; `job` is what a program is told about the arrays; `compiler` and `cache` make and keep
+machine code; `threads` runs it.
 
 Same meaning as `ops.reference`, orders 0 … 3. Coefficients are read as they are stored, sums are in the points' dtype.
-The result of jet does not depend on the number of threads, bit by bit; that of splat only on their number.
+The result of gather does not depend on the number of threads, bit by bit; that of scatter only on their number. Points
+that lie all over a large volume are sorted first (`order`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -21,27 +24,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.kernels import Kernel, PiecewisePolynomial
-from filterlab.ops.reference import multi_indices
+from filterlab.ops.fused import MAX_ORDER as MAX_ORDER
+from filterlab.ops.fused import STORAGE, readable, unsupported
+from filterlab.ops.stencil import Stencil
+from filterlab.volume import Boundary
 
 if TYPE_CHECKING:
     from filterlab.ops.cpu.job import Job
+    from filterlab.ops.cpu.order import Sorted
+    from filterlab.ops.placement import Placement
 
-MAX_ORDER = 3
-MAX_SUPPORT = 6
-SPLAT_MEMORY = 1 << 30  # bytes that splat may take for partial results beyond the result itself
+SPLAT_MEMORY = 1 << 30  # bytes that scatter may take for partial results beyond the result itself
 
 _ARITHMETIC = {torch.float32: "float32", torch.float64: "float64"}
-_STORAGE = {
-    torch.float32: "float32",
-    torch.float64: "float64",
-    torch.float16: "float16",
-    torch.bfloat16: "bfloat16",
-    torch.uint8: "uint8",
-    torch.int8: "int8",
-    torch.int16: "int16",
-    torch.int32: "int32",
-}
 _COORDINATES = {torch.float32: 1 << 24, torch.float64: 1 << 28}  # exact in the dtype; 8 times it fits 32 bits
 _POINTS_PER_THREAD = 4096  # fewer are not worth waking a thread for
 _CHUNKS_PER_THREAD = 16  # so that a thread that is held up leaves its share to the others
@@ -50,35 +45,25 @@ _CHUNKS_PER_THREAD = 16  # so that a thread that is held up leaves its share to 
 def missing(
     coefficients: Tensor,
     points: Tensor,
-    kernels: Sequence[PiecewisePolynomial],
-    order: int,
+    stencil: Stencil,
     shape: Sequence[int] | None = None,
     start: int = 0,
 ) -> str | None:
-    """What keeps jet (or, with `shape`, splat of cotangents) from running here as asked; None: nothing does.
+    """What keeps gather (or, with `shape`, scatter of cotangents) from running here as asked; None: nothing does.
 
     Args:
-        coefficients: (N, C, D, H, W), or the cotangents (N, C, J, M) of splat.
+        coefficients: (N, C, D, H, W), or the cotangents (N, C, J, M) of scatter.
         points: (N, M, 3).
-        kernels: one per axis x, y, z.
-        order: of the highest derivative.
-        shape: (D, H, W) of the result of splat.
+        stencil: what is summed.
+        shape: (D, H, W) of the result of scatter.
         start: the coordinate of coefficient 0.
     """
     if problem := _llvmlite_problem():
         return problem
     if coefficients.device.type != "cpu" or points.device.type != "cpu":
         return f"it works on tensors of the CPU; got {coefficients.device} and {points.device}"
-    if points.dtype not in _ARITHMETIC:
-        return f"points must be float32 or float64; got {points.dtype}"
-    if shape is None and coefficients.dtype not in _STORAGE:
-        return f"coefficients must be stored as {', '.join(_STORAGE.values())}; got {coefficients.dtype}"
-    if not all(isinstance(k, Kernel) for k in kernels):
-        return f"its kernels are fixed tables; got {', '.join(type(k).__name__ for k in kernels)}"
-    if max(k.support for k in kernels) > MAX_SUPPORT:
-        return f"supports go up to {MAX_SUPPORT}; got {', '.join(str(k.support) for k in kernels)}"
-    if order > MAX_ORDER:
-        return f"orders go up to {MAX_ORDER}; got {order}"
+    if problem := unsupported(coefficients, points, stencil, shape):
+        return problem
     sizes, limit = tuple(coefficients.shape[2:] if shape is None else shape), _COORDINATES[points.dtype]
     if abs(start) + max(sizes) >= limit or sizes[0] * sizes[1] >= 1 << 31:
         return f"indices along an axis must stay below {limit} and rows below {1 << 31}; got {sizes} from {start}"
@@ -94,22 +79,27 @@ def _llvmlite_problem() -> str | None:
     return None
 
 
-def jet(coefficients: Tensor, points: Tensor, kernels: Sequence[Kernel], order: int, start: int = 0) -> Tensor:
-    """`ops.reference.jet`, fused. Nothing is copied but what is not contiguous within a channel or a batch entry."""
+def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
+    """`ops.reference.gather`, fused. Nothing is copied but what is not contiguous within a channel or a batch entry."""
     n, c = coefficients.shape[:2]
-    rows = len(multi_indices(order))
-    out = _fresh((n, c, rows, points.shape[1]), points.dtype, np.empty)
+    out = _fresh((n, c, len(stencil.rows), points.shape[1]), points.dtype, np.empty)
     if out.numel() == 0:
         return out
-    coefficients, points = _readable(coefficients, 2), _readable(points, 1)
-    _run("jet", [coefficients] * _useful_threads(points), points, out, kernels, order, start)
+    coefficients, points = readable(coefficients, 2), readable(points, 1)
+    if not _sorting_pays(points, coefficients.shape, coefficients.element_size()):
+        _run("gather", [coefficients] * _useful_threads(points), points, out, stencil, start)
+        return out
+    for entry, part, ordered in _in_order(points, coefficients.shape, start):
+        rows = _fresh((1, c, len(stencil.rows), ordered.count), points.dtype, np.empty)
+        threads = _useful_threads(ordered.points[None])
+        _run("gather", [coefficients[entry : entry + 1]] * threads, ordered.points[None], rows, stencil, start)
+        for channel in range(c):
+            ordered.restore(rows[0, channel], out[entry, channel, :, part])
     return out
 
 
-def splat(
-    cotangents: Tensor, points: Tensor, kernels: Sequence[Kernel], order: int, shape: Sequence[int], start: int = 0
-) -> Tensor:
-    """`ops.reference.splat`, fused.
+def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int], start: int = 0) -> Tensor:
+    """`ops.reference.scatter`, fused.
 
     Each thread takes an equal share of the points and adds into a partial result of its own; these are summed at the
     end, in order. Partial results take at most `SPLAT_MEMORY` beyond the result itself: fewer threads work when the
@@ -124,11 +114,119 @@ def splat(
     if not (cotangents.numel() and volume):
         return out
     more = [_fresh(out.shape, out.dtype, np.zeros) for _ in range(parts - 1)]
-    cotangents, points = _readable(cotangents.to(points.dtype), 0), _readable(points, 1)
-    _run("splat", [out, *more], points, cotangents, kernels, order, start)
+    cotangents, points = readable(cotangents.to(points.dtype), 0), readable(points, 1)
+    if not _sorting_pays(points, out.shape, points.element_size()):
+        _run("scatter", [out, *more], points, cotangents, stencil, start)
+    else:
+        for entry, part, ordered in _in_order(points, out.shape, start):
+            rows = _fresh((1, *cotangents.shape[1:3], ordered.count), points.dtype, np.empty)
+            for channel in range(c):
+                ordered.arrange(cotangents[entry, channel, :, part], rows[0, channel])
+            own = [volume[entry : entry + 1] for volume in (out, *more)]
+            _run("scatter", own, ordered.points[None], rows, stencil, start)
     for part in more:
         out += part
     return out
+
+
+def pull(coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
+    """The adjoint of gather to its points, (N, M, 3): Σ over channels and rows of cotangent · gradient of the row."""
+    out = _fresh(points.shape, points.dtype, np.zeros)
+    if cotangents.numel() == 0 or out.numel() == 0:
+        return out
+    coefficients, points = readable(coefficients, 2), readable(points, 1)
+    cotangents = readable(cotangents.to(points.dtype), 0)
+    threads = [coefficients] * _useful_threads(points)
+    derivatives, raised = stencil.derivatives
+    if not _sorting_pays(points, coefficients.shape, coefficients.element_size()):
+        _run("pull", threads, points, cotangents, derivatives, start, raised, out)
+        return out
+    for entry, part, ordered in _in_order(points, coefficients.shape, start):
+        rows = _fresh((1, *cotangents.shape[1:3], ordered.count), points.dtype, np.empty)
+        for channel in range(rows.shape[1]):
+            ordered.arrange(cotangents[entry, channel, :, part], rows[0, channel])
+        own = _fresh((1, ordered.count, 3), points.dtype, np.empty)
+        one = [volume[entry : entry + 1] for volume in threads]
+        _run("pull", one, ordered.points[None], rows, derivatives, start, raised, own)
+        back = _fresh((3, ordered.count), points.dtype, np.empty)
+        ordered.restore(own[0].T.contiguous(), back)
+        out[entry, part] = back.T
+    return out
+
+
+def _sorting_pays(points: Tensor, shape: Sequence[int], bytes_each: int) -> bool:
+    from filterlab.ops.cpu import order
+
+    return order.pays(points, math.prod(shape[2:]) * bytes_each)
+
+
+def _in_order(points: Tensor, shape: Sequence[int], start: int) -> Iterator[tuple[int, slice, Sorted]]:
+    """(batch entry, which of its points, those points sorted), part by part, so that copies stay bounded."""
+    from filterlab.ops.cpu import compiler, order
+
+    lanes = _lanes(compiler.features(), points.element_size())
+    count = points.shape[1]
+    parts = -(-count // order.POINTS_AT_ONCE)
+    for entry, own in enumerate(points):
+        for i in range(parts):
+            part = slice(count * i // parts, count * (i + 1) // parts)
+            yield entry, part, order.Sorted(own[part], (shape[2], shape[3], shape[4]), start, lanes)
+
+
+def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor | None]:
+    """`ops.place`, fused: (located, sign); sign None where it is 1 everywhere."""
+    from filterlab.ops.cpu import compiler, folding
+    from filterlab.ops.cpu import threads as pool
+    from filterlab.ops.cpu.job import AXES
+
+    located = _fresh(points.shape, points.dtype, np.empty)
+    if points.numel() == 0:
+        return located, None
+    points = readable(points, 0)
+    lanes, geometry = _lanes(compiler.features(), points.element_size()), placement.geometry
+    count = points.numel() // 3
+    threads = max(1, min(torch.get_num_threads(), count // _POINTS_PER_THREAD))
+    packs = -(-count // lanes)
+    chunk = -(-packs // (threads * _CHUNKS_PER_THREAD if threads > 1 else 1))
+    chunks = -(-packs // chunk)
+    turned = np.zeros(chunks, np.int64)
+    job = folding.Job(
+        points=points.data_ptr(),
+        located=located.data_ptr(),
+        turned=turned.ctypes.data,
+        count=count,
+        chunk=chunk,
+        chunks=chunks,
+        shift=placement.shift,
+    )
+    for i, (a, n) in enumerate(zip(AXES, placement.size, strict=True)):
+        setattr(job, f"origin_{a}", geometry.origin[i])
+        low, high = placement.boundary.interval(n, placement.tail)
+        setattr(job, f"low_{a}", low)
+        setattr(job, f"high_{a}", high)
+        for j, b in enumerate(AXES):
+            setattr(job, f"matrix_{a}{b}", geometry.inverse[i][j])
+    x, y, z = (_how_it_folds(placement.boundary, n) for n in placement.size)
+    affine = "identity" if geometry.is_identity else "full" if geometry.diagonal is None else "diagonal"
+
+    def run(signs: bool) -> None:
+        recipe = folding.Recipe((x, y, z), affine, signs, _ARITHMETIC[points.dtype], lanes)
+        job.next = 0
+        pool.run(compiler.compiled(recipe), [job] * threads)
+
+    run(False)
+    if not turned.any():
+        return located, None
+    sign = _fresh(points.shape, points.dtype, np.empty)
+    job.signs = sign.data_ptr()
+    run(True)
+    return located, sign
+
+
+def _how_it_folds(boundary: Boundary, n: int) -> str:
+    if boundary is Boundary.MIRROR and n == 1:
+        return "flat"
+    return {Boundary.MIRROR: "reflect", Boundary.REFLECT: "reflect", Boundary.WRAP: "wrap"}.get(boundary, "clamp")
 
 
 def _fresh(shape: Sequence[int], dtype: torch.dtype, make: Callable[..., np.ndarray]) -> Tensor:
@@ -144,34 +242,35 @@ def _run(
     volumes: Sequence[Tensor],
     points: Tensor,
     rows: Tensor,
-    kernels: Sequence[Kernel],
-    order: int,
+    stencil: Stencil,
     start: int,
+    raised: tuple[tuple[int, ...], ...] = (),
+    gradient: Tensor | None = None,
 ) -> None:
     """Compile, describe the arrays, and let the threads loose, one for each of `volumes`.
 
     Args:
-        operation: "jet" or "splat".
-        volumes: for jet the coefficients, as often as there are threads: all of them share the work, chunk by chunk.
-            For splat as many volumes of zeros: each is given an equal share of the points.
-        points, kernels, order, start: as for `jet`.
-        rows: (N, C, J, M), contiguous; written by jet, read by splat.
+        operation: "gather", "scatter" or "pull".
+        volumes: for gather and pull the coefficients, as often as there are threads: all of them share the work, chunk
+            by chunk. For scatter as many volumes of zeros: each is given an equal share of the points.
+        points, stencil, start: as for `gather`.
+        rows: (N, C, J, M), contiguous; written by gather, read by scatter and pull.
+        raised, gradient: for pull, as in its recipe and its result.
     """
     from filterlab.ops.cpu import compiler
     from filterlab.ops.cpu import threads as pool
-    from filterlab.ops.cpu.generator import BLOCK, Recipe
     from filterlab.ops.cpu.job import AXES, Job
+    from filterlab.ops.cpu.points import BLOCK, Recipe
 
     coefficients, threads = volumes[0], len(volumes)
     assert all(t.data_ptr() for t in (*volumes, points, rows)), "tensors without memory"
-    arithmetic, storage = _ARITHMETIC[points.dtype], _STORAGE[coefficients.dtype]
+    arithmetic, storage = _ARITHMETIC[points.dtype], STORAGE[coefficients.dtype]
     lanes = _lanes(compiler.features(), points.element_size())
-    tables = tuple(_table(k) for k in kernels)
-    function = compiler.compiled(Recipe(operation, tables, order, arithmetic, storage, lanes))  # type: ignore[arg-type]
+    function = compiler.compiled(Recipe(operation, stencil.lowered, arithmetic, storage, lanes, raised))
 
     entries, count = points.shape[:2]
     packs = -(-count // lanes)
-    shared = operation == "jet"
+    shared = operation != "scatter"
     chunk = -(-packs // (threads * _CHUNKS_PER_THREAD if shared and threads > 1 else threads))
     chunk = -(-chunk // BLOCK) * BLOCK
     parts = -(-packs // chunk)  # of every batch entry
@@ -180,6 +279,7 @@ def _run(
         coefficients=coefficients.data_ptr(),
         points=points.data_ptr(),
         rows=rows.data_ptr(),
+        gradient=None if gradient is None else gradient.data_ptr(),
         channels=coefficients.shape[1],
         count=count,
         width=w,
@@ -193,9 +293,9 @@ def _run(
         next=0,
         chunks=parts * entries,
     )
-    for axis, size, kernel in zip(AXES, (w, h, d), kernels, strict=True):
+    for axis, size, support in zip(AXES, (w, h, d), stencil.supports, strict=True):
         setattr(job, f"low_{axis}", start)
-        setattr(job, f"high_{axis}", start + size - kernel.support)
+        setattr(job, f"high_{axis}", start + size - support)
     pool.run(function, [job] * threads if shared else [_own_share(job, i, v) for i, v in enumerate(volumes[:parts])])
 
 
@@ -209,11 +309,6 @@ def _own_share(job: Job, part: int, volume: Tensor) -> Job:
     return own
 
 
-@lru_cache(maxsize=256)
-def _table(kernel: Kernel) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(row) for row in kernel.taps(torch.float64).tolist())
-
-
 def _lanes(features: frozenset[str], element_size: int) -> int:
     """P: 8 floats or 4 doubles; twice as many with AVX-512.
 
@@ -225,10 +320,3 @@ def _lanes(features: frozenset[str], element_size: int) -> int:
 
 def _useful_threads(points: Tensor) -> int:
     return max(1, min(torch.get_num_threads(), points.shape[0] * points.shape[1] // _POINTS_PER_THREAD))
-
-
-def _readable(tensor: Tensor, outer: int) -> Tensor:
-    """The tensor with everything after its first `outer` dimensions lying together; any strides before (0 too)."""
-    tensor = tensor.detach().resolve_neg()
-    together = tensor[(0,) * outer].is_contiguous()
-    return tensor if together else tensor.contiguous()

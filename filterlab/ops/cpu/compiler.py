@@ -1,27 +1,36 @@
 """From a recipe to a function that can be called: LLVM through llvmlite, with the result kept on disk.
 
 Compiling takes a few tenths of a second, loading a few milliseconds. What a stored kernel is found by contains all that
-it depends on: the recipe, the text of the generator, LLVM's version, the machine.
+it depends on: the recipe, the text of this package, LLVM's version, the machine.
 """
 
 from __future__ import annotations
 
 import ctypes
 import hashlib
-import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import cache
+from importlib import resources
 from threading import RLock
+from typing import Protocol
 
 from llvmlite import binding as llvm
 
 from filterlab.ops.cpu import cache as disk
-from filterlab.ops.cpu.generator import ENTRY, Recipe, generate
+from filterlab.ops.cpu.frame import ENTRY
 
 Function = Callable[[int], None]
 """Takes the address of a `Job` and works until its chunks are used up; lets other Python threads run meanwhile."""
 
-_SOURCES = ("generator.py", "lanes.py", "job.py", "compiler.py")
+
+class Recipe(Hashable, Protocol):
+    """A frozen dataclass with everything that a program depends on, apart from the machine."""
+
+    def generate(self) -> str:
+        """The program as LLVM IR text, with the entry point `frame.ENTRY`."""
+        ...
+
+
 _lock = RLock()
 _engines: list[llvm.ExecutionEngine] = []  # they own the machine code
 
@@ -50,7 +59,8 @@ def features() -> frozenset[str]:
 
 @cache
 def _surroundings() -> tuple[object, ...]:
-    text = b"".join(pkgutil.get_data("filterlab.ops.cpu", source) or b"" for source in _SOURCES)
+    sources = [s for s in resources.files("filterlab.ops.cpu").iterdir() if s.name.endswith(".py")]
+    text = b"".join(source.read_bytes() for source in sorted(sources, key=lambda s: s.name))
     cpu = llvm.get_host_cpu_name(), sorted(features()), llvm.get_process_triple()
     return hashlib.sha256(text).hexdigest(), llvm.llvm_version_info, cpu
 
@@ -69,9 +79,9 @@ def _machine() -> llvm.TargetMachine:
 
 
 def _compile(recipe: Recipe) -> bytes:
-    """An object file. The generator has written vectors and loops as they should be: LLVM shall not rearrange them."""
+    """An object file. Our programs have vectors and loops as they should be: LLVM shall not rearrange them."""
     machine = _machine()
-    module = llvm.parse_assembly(generate(recipe))
+    module = llvm.parse_assembly(recipe.generate())
     module.triple = machine.triple
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=2)

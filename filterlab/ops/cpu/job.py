@@ -1,4 +1,4 @@
-"""What a compiled kernel is told: one struct of 64-bit fields, described once for Python and for the generator."""
+"""What a compiled kernel is told: one struct of 64-bit fields, described once for Python and for the program."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ AXES = ("x", "y", "z")
 # name: ctypes type. Strides are in elements, every field has eight bytes, so both sides agree on the layout.
 FIELDS: dict[str, type] = {
     "next": ctypes.c_int64,  # the chunk to be taken next; threads add 1 atomically
-    "coefficients": ctypes.c_void_p,  # (N, C, D, H, W); read by jet, added to by splat
+    "coefficients": ctypes.c_void_p,  # (N, C, D, H, W); read by gather, added to by scatter
     "points": ctypes.c_void_p,  # (N, M, 3)
-    "rows": ctypes.c_void_p,  # (N, C, J, M); written by jet, read by splat
+    "rows": ctypes.c_void_p,  # (N, C, J, M); written by gather, read by scatter and pull
+    "gradient": ctypes.c_void_p,  # (N, M, 3); written by pull
     "channels": ctypes.c_int64,  # C
     "count": ctypes.c_int64,  # M, points of one batch entry
     "width": ctypes.c_int64,  # W

@@ -1,4 +1,4 @@
-"""The instructions that the generator speaks: arithmetic on packs, rows in and out of memory, loops.
+"""The instructions that programs are written in: arithmetic on packs, rows in and out of memory, loops.
 
 LLVM IR in six lines. A program is a list of instructions; each makes one new value that never changes afterwards. A
 value has a type: i64 an integer of 64 bits, float, ptr an address, <8 x float> eight floats side by side. Instructions
@@ -13,7 +13,7 @@ arithmetic below is written once and done for P points at a time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -57,6 +57,9 @@ STORAGE = {
     "int16": Storage(I16, 2, "signed"),
     "int32": Storage(I32, 4, "signed"),
 }
+
+
+_WHOLE = 1.5 * 2.0**52
 
 
 class Variable:
@@ -122,8 +125,92 @@ class Lanes:
             value = self.multiply_add(value, u, self.constant(c) if c else None)
         return value
 
+    def divide(self, a: Value, b: Value) -> Value:
+        return self.builder.fdiv(a, b, flags=FLAGS)
+
+    def negate(self, a: Value) -> Value:
+        return self.builder.fneg(a)
+
     def floor(self, a: Value) -> Value:
         return self._intrinsic(f"llvm.floor.v{self.count}f{self.bits}", self.pack, [a])
+
+    def absolute(self, a: Value) -> Value:
+        return self._intrinsic(f"llvm.fabs.v{self.count}f{self.bits}", self.pack, [a])
+
+    def square_root(self, a: Value) -> Value:
+        return self._intrinsic(f"llvm.sqrt.v{self.count}f{self.bits}", self.pack, [a])
+
+    def minimum(self, a: Value, b: Value) -> Value:
+        """The smaller one; b where either is NaN."""
+        return self.builder.select(self.builder.fcmp_ordered("<", a, b), a, b)
+
+    def maximum(self, a: Value, b: Value) -> Value:
+        """The larger one; b where either is NaN."""
+        return self.builder.select(self.builder.fcmp_ordered(">", a, b), a, b)
+
+    def differs(self, a: Value, number: float = 0.0) -> Value:
+        """A mask: a ≠ number, NaN included."""
+        return self.builder.fcmp_unordered("!=", a, self.constant(number))
+
+    def where(self, mask: Value, a: Value, b: Value) -> Value:
+        return self.builder.select(mask, a, b)
+
+    def bits_of(self, a: Value) -> Value:
+        """The bit patterns of a pack, integers of the same size."""
+        return self.builder.bitcast(a, ir.VectorType(ir.IntType(self.bits), self.count))
+
+    def of_bits(self, a: Value) -> Value:
+        return self.builder.bitcast(a, self.pack)
+
+    def integers(self, value: int) -> Value:
+        """The same integer, as large as a number of the arithmetic, in every lane."""
+        kind = ir.VectorType(ir.IntType(self.bits), self.count)
+        return ir.Constant(kind, [value] * self.count)
+
+    def to_bits_size(self, a: Value) -> Value:
+        """Whole numbers (below 2⁵¹) to integers as large as a number of the arithmetic."""
+        if self.bits == 32:
+            return self.builder.fptosi(a, ir.VectorType(I32, self.count))
+        # few machines convert packs to 64 bits: added to 1.5 · 2⁵², a whole number stands in the last bits of the sum
+        return self.builder.sub(self.bits_of(self.add(a, self.constant(_WHOLE))), self.bits_of(self.constant(_WHOLE)))
+
+    def of_bits_size(self, a: Value) -> Value:
+        """The reverse."""
+        if self.bits == 32:
+            return self.builder.sitofp(a, self.pack)
+        whole = self.constant(_WHOLE)
+        return self.subtract(self.of_bits(self.builder.add(a, self.bits_of(whole))), whole)
+
+    def delayed(self, a: Value, by: int) -> Value:
+        """Lane i gets what lane i − by has; zeros come in at the start."""
+        return self.shuffle(
+            self.constant(0), a, [lane if lane < by else self.count + lane - by for lane in range(self.count)]
+        )
+
+    def running_sums(self, a: Value) -> Value:
+        """Lane i gets the sum of lanes 0 … i, in log₂P steps."""
+        by = 1
+        while by < self.count:
+            a, by = self.add(a, self.delayed(a, by)), 2 * by
+        return a
+
+    def total(self, a: Value) -> Value:
+        """The sum of all lanes as one number, halves added to halves."""
+        half = self.count // 2
+        while half:
+            a, half = (
+                self.add(a, self.shuffle(a, a, [(lane + half) % self.count for lane in range(self.count)])),
+                half // 2,
+            )
+        return self.lane(a, 0)
+
+    def lane(self, a: Value, number: int) -> Value:
+        return self.builder.extract_element(a, I32(number))
+
+    def any(self, mask: Value) -> Value:
+        """Whether the mask is true in some lane."""
+        kind = ir.IntType(self.count)
+        return self.builder.icmp_unsigned("!=", self.builder.bitcast(mask, kind), kind(0))
 
     def clamp(self, a: Value, low: Value, high: Value) -> Value:
         """min(max(a, low), high), and low where a is NaN: a comparison with NaN is false and its else branch counts."""
@@ -148,6 +235,41 @@ class Lanes:
     def shuffle(self, a: Value, b: Value, pattern: Sequence[int]) -> Value:
         return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(pattern)), list(pattern)))
 
+    def transpose(self, packs: Sequence[Value]) -> list[Value]:
+        """P packs as the rows of a P×P table -> its columns.
+
+        First within groups of 128 bits, which machines interleave in one instruction (as drawn at the head of
+        `ops.cpu.taps`), then whole groups change places.
+        """
+        packs, count = list(packs), self.count
+        group = 128 // self.bits
+        tables = [self._transpose_groups(packs[first : first + group]) for first in range(0, count, group)]
+        packs = [pack for table in tables for pack in table]
+        distance = group
+        while distance < count:
+            for i in (i for i in range(count) if not i & distance):
+                a, b, lower = packs[i], packs[i + distance], [lane & distance == 0 for lane in range(count)]
+                own = [lane if low else count + lane - distance for lane, low in enumerate(lower)]
+                other = [lane + distance if low else count + lane for lane, low in enumerate(lower)]
+                packs[i], packs[i + distance] = self.shuffle(a, b, own), self.shuffle(a, b, other)
+            distance *= 2
+        return packs
+
+    def _transpose_groups(self, packs: list[Value]) -> list[Value]:
+        """As many packs as a group has lanes; every group of lanes is transposed for itself (a perfect shuffle)."""
+        half = len(packs) // 2
+        low = [first + lane for first in range(0, self.count, 2 * half) for lane in range(half)]
+        low, high = ([n for lane in side for n in (lane, self.count + lane)] for side in (low, [n + half for n in low]))
+        for _ in range(half.bit_length()):
+            pairs = zip(packs[:half], packs[half:], strict=True)
+            packs = [self.shuffle(a, b, pattern) for a, b in pairs for pattern in (low, high)]
+        return packs
+
+    def first_lanes(self, count: Value) -> Value:
+        """True in as many lanes as the integer says, at most P: a mask for the end of a row."""
+        lanes = ir.Constant(ir.VectorType(I64, self.count), list(range(self.count)))
+        return self.builder.icmp_signed("<", lanes, self.everywhere(count))
+
     def convert(self, raw: Value, storage: Storage) -> Value:
         """A pack as it lay in memory, as a pack of this arithmetic."""
         b, n = self.builder, self.count
@@ -165,9 +287,25 @@ class Lanes:
             return raw
         return b.fptrunc(raw, self.pack) if source == DOUBLE else b.fpext(raw, self.pack)
 
+    def scalar(self, number: Value) -> Value:
+        """A double as a number of this arithmetic."""
+        return number if self.number == DOUBLE else self.builder.fptrunc(number, self.number)
+
+    def all(self, condition: Value) -> Value:
+        """Whether a condition holds in every lane."""
+        mask = self.builder.bitcast(condition, ir.IntType(self.count))
+        return self.builder.icmp_unsigned("==", mask, mask.type(2**self.count - 1))
+
     def smaller(self, a: Value, b: Value) -> Value:
         """The smaller one of two integers."""
         return self.builder.select(self.builder.icmp_signed("<", a, b), a, b)
+
+    def product(self, *factors: Value) -> Value:
+        """Of integers."""
+        product, *others = factors
+        for factor in others:
+            product = self.builder.mul(product, factor)
+        return product
 
     def opaque(self, a: Value) -> Value:
         """The same integer, as if it came from nowhere: an empty piece of assembly that LLVM can't look into.
@@ -199,9 +337,34 @@ class Lanes:
             last = self.load(self.advance(address, I64(2), storage.raw), storage.raw, 1)
             return self.shuffle(pair, self.shuffle(last, last, [0, 0]), [0, 1, 2, 3])
         quad = ir.VectorType(storage.raw, 4)
-        suffix = ("i" if isinstance(storage.raw, ir.IntType) else "f") + str(8 * storage.bytes)
         mask = ir.Constant(ir.VectorType(I1, 4), [True, True, True, False])
-        return self._intrinsic(f"llvm.masked.load.v4{suffix}.p0", quad, [address, mask, ir.Constant(quad, None)])
+        return self._intrinsic(
+            f"llvm.masked.load.v4{_suffix(storage.raw)}.p0", quad, [address, mask, ir.Constant(quad, None)]
+        )
+
+    def load_masked(self, address: Value, element: ir.Type, mask: Value) -> Value:
+        """Numbers that lie one after the other, zeros where the mask is false: nothing is read there."""
+        kind = ir.VectorType(element, self.count)
+        name = f"llvm.masked.load.v{self.count}{_suffix(element)}.p0"
+        return self._intrinsic(name, kind, [address, mask, ir.Constant(kind, None)])
+
+    def store_masked(self, value: Value, address: Value, mask: Value) -> None:
+        """Write the lanes in which the mask is true, nothing else."""
+        name = f"llvm.masked.store.v{self.count}{_suffix(value.type.element)}.p0"
+        self._intrinsic(name, ir.VoidType(), [value, address, mask])
+
+    def load_triples(self, address: Value) -> list[Value]:
+        """x y z x y z … -> a pack of x, a pack of y, a pack of z."""
+        triples = self.load(address, self.number, 3 * self.count)
+        return [self.shuffle(triples, triples, range(axis, 3 * self.count, 3)) for axis in range(3)]
+
+    def store_triples(self, packs: list[Value], address: Value) -> None:
+        """The inverse of `load_triples`."""
+        x, y, z = packs
+        xy = self.shuffle(x, y, range(2 * self.count))
+        zz = self.shuffle(z, z, [*range(self.count)] * 2)
+        order = [lane + axis * self.count for lane in range(self.count) for axis in range(3)]
+        self.store(self.shuffle(xy, zz, order), address)
 
     def reserve(self, element: ir.Type, count: int) -> Value:
         """Address of `count` elements on the stack; write this before any loop."""
@@ -247,7 +410,25 @@ class Lanes:
         b.cbranch(b.icmp_signed("<", following, end), body, after)
         b.position_at_end(after)
 
+    @contextmanager
+    def repeat_while(self, condition: Callable[[], Value]) -> Iterator[None]:
+        """while condition(): what the with-block writes."""
+        b = self.builder
+        test, body, after = (b.append_basic_block(name) for name in ("test", "body", "after"))
+        b.branch(test)
+        b.position_at_end(test)
+        b.cbranch(condition(), body, after)
+        b.position_at_end(body)
+        yield
+        b.branch(test)
+        b.position_at_end(after)
+
 
 def _size(element: Any) -> int:
     """Bytes of a number in memory, which is also all the alignment that may be counted on."""
     return {FLOAT: 4, DOUBLE: 8, HALF: 2}.get(element) or element.width // 8
+
+
+def _suffix(element: Any) -> str:
+    """How LLVM's intrinsics call a type: i16, f32."""
+    return ("i" if isinstance(element, ir.IntType) else "f") + str(8 * _size(element))

@@ -6,9 +6,11 @@ import ctypes
 import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any
 
 from filterlab.ops.cpu.compiler import Function
-from filterlab.ops.cpu.job import Job
+
+Job = Any  # a ctypes.Structure with the fields `next` (the chunk to be taken next) and `chunks` (where it stops)
 
 MOST = 1024  # threads; they start when they are first needed
 

@@ -1,0 +1,166 @@
+"""gather, scatter and place as operators that torch.compile takes whole.
+
+torch.compile does not look into an `autograd.Function` with forward mode, so that while it traces, the same operations
+go by these `torch.library` operators. What is no tensor travels as text: operators take nothing else, and a compiled
+graph that is stored on disk must find its stencil again.
+"""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+from torch.library import custom_op
+
+from filterlab.kernels import Kernel
+from filterlab.ops import autograd, placement
+from filterlab.ops.placement import Placement
+from filterlab.ops.stencil import Product, Stencil
+from filterlab.volume import Boundary, Geometry
+
+
+@torch.compiler.assume_constant_result
+def stencil_text(stencil: Stencil) -> str:
+    """The stencil as JSON; `stencil_of` is the inverse."""
+    kernels = list(dict.fromkeys(k for row in stencil.rows for p in row for k in p.kernels))
+    tables = [[k.name, [[str(c) for c in piece] for piece in k.pieces]] for k in kernels]  # type: ignore[attr-defined]
+    rows = [[[p.weight, [kernels.index(k) for k in p.kernels], p.orders] for p in row] for row in stencil.rows]
+    return json.dumps([tables, rows], separators=(",", ":"))
+
+
+@lru_cache(maxsize=1024)
+def stencil_of(text: str) -> Stencil:
+    tables, rows = json.loads(text)
+    kernels = [Kernel(name, tuple(tuple(Fraction(c) for c in piece) for piece in pieces)) for name, pieces in tables]
+    return Stencil(
+        tuple(
+            tuple(
+                Product((kernels[x], kernels[y], kernels[z]), tuple(orders), weight)  # type: ignore[arg-type]
+                for weight, (x, y, z), orders in row
+            )
+            for row in rows
+        )
+    )
+
+
+@torch.compiler.assume_constant_result
+def placement_text(placement: Placement) -> str:
+    """The placement as JSON; `placement_of` is the inverse."""
+    g = placement.geometry
+    return json.dumps([g.matrix, g.origin, placement.boundary, placement.size, placement.tail, placement.shift])
+
+
+@lru_cache(maxsize=1024)
+def placement_of(text: str) -> Placement:
+    matrix, origin, boundary, size, tail, shift = json.loads(text)
+    geometry = Geometry(tuple(map(tuple, matrix)), tuple(origin))
+    return Placement(geometry, Boundary(boundary), tuple(size), tail, shift)
+
+
+# --- gather -----------------------------------------------------------------------------------------------------------
+
+
+@custom_op("filterlab::gather", mutates_args=())
+def gather(coefficients: Tensor, points: Tensor, stencil: str, start: int, implementation: str) -> Tensor:
+    """`ops.gather` of a stencil given as text."""
+    return autograd.gather(coefficients, points, stencil_of(stencil), start, implementation).contiguous()
+
+
+@gather.register_fake
+def _(coefficients: Tensor, points: Tensor, stencil: str, start: int, implementation: str) -> Tensor:
+    n, c = coefficients.shape[:2]
+    return points.new_empty((n, c, len(stencil_of(stencil).rows), points.shape[1]))
+
+
+def _keep_gather(ctx, inputs, output) -> None:
+    coefficients, points, *ctx.rest = inputs
+    ctx.save_for_backward(coefficients, points)
+
+
+def _gather_backward(ctx, cotangents: Tensor):
+    coefficients, points = ctx.saved_tensors
+    stencil, start, implementation = ctx.rest
+    to_coefficients = to_points = None
+    if ctx.needs_input_grad[0]:
+        d, h, w = coefficients.shape[2:]
+        spread = scatter(cotangents.contiguous(), points, stencil, [d, h, w], start, implementation)
+        to_coefficients = spread.to(coefficients.dtype)
+    if ctx.needs_input_grad[1]:
+        to_points = _to_points(coefficients, points, cotangents, stencil, start, implementation)
+    return to_coefficients, to_points, None, None, None
+
+
+def _to_points(coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: str, *rest) -> Tensor:
+    own = stencil_of(stencil)
+    raised = gather(coefficients, points, stencil_text(own.derivatives[0]), *rest)
+    return autograd.gradient_to_points(raised, cotangents, own)
+
+
+gather.register_autograd(_gather_backward, setup_context=_keep_gather)
+
+
+# --- scatter ----------------------------------------------------------------------------------------------------------
+
+
+@custom_op("filterlab::scatter", mutates_args=())
+def scatter(
+    cotangents: Tensor, points: Tensor, stencil: str, shape: list[int], start: int, implementation: str
+) -> Tensor:
+    """`ops.scatter` of a stencil given as text."""
+    out = autograd.scatter(cotangents, points, stencil_of(stencil), tuple(shape), start, implementation)
+    return out.contiguous()
+
+
+@scatter.register_fake
+def _(cotangents: Tensor, points: Tensor, stencil: str, shape: list[int], start: int, implementation: str) -> Tensor:
+    return points.new_empty((*cotangents.shape[:2], *shape))
+
+
+def _keep_scatter(ctx, inputs, output) -> None:
+    cotangents, points, ctx.stencil, _, *ctx.rest = inputs
+    ctx.save_for_backward(cotangents, points)
+
+
+def _scatter_backward(ctx, incoming: Tensor):
+    cotangents, points = ctx.saved_tensors
+    to_cotangents = to_points = None
+    if ctx.needs_input_grad[0]:
+        to_cotangents = gather(incoming.contiguous(), points, ctx.stencil, *ctx.rest)
+    if ctx.needs_input_grad[1]:
+        to_points = _to_points(incoming.contiguous(), points, cotangents, ctx.stencil, *ctx.rest)
+    return to_cotangents, to_points, None, None, None, None
+
+
+scatter.register_autograd(_scatter_backward, setup_context=_keep_scatter)
+
+
+# --- place ------------------------------------------------------------------------------------------------------------
+
+
+@custom_op("filterlab::place", mutates_args=())
+def place(points: Tensor, where: str, implementation: str) -> tuple[Tensor, Tensor]:
+    """`ops.place` at a placement given as text; the sign always as a tensor."""
+    located, sign = placement.evaluate(points, placement_of(where), implementation)
+    return located.contiguous().clone() if located is points else located.contiguous(), sign.contiguous()
+
+
+@place.register_fake
+def _(points: Tensor, where: str, implementation: str) -> tuple[Tensor, Tensor]:
+    return points.new_empty(points.shape), points.new_empty(points.shape)
+
+
+def _keep_place(ctx, inputs, output) -> None:
+    ctx.geometry = placement_of(inputs[1]).geometry
+    ctx.mark_non_differentiable(output[1])
+    ctx.save_for_backward(output[1])
+
+
+def _place_backward(ctx, to_located: Tensor, to_sign: Tensor):
+    (sign,) = ctx.saved_tensors
+    return ctx.geometry.gradient_to_world(to_located * sign), None, None
+
+
+place.register_autograd(_place_backward, setup_context=_keep_place)

@@ -1,0 +1,102 @@
+"""Points brought into an order in which neighbours in memory are neighbours in space, where that pays.
+
+Points along rays are in such an order already. Points that are not (random ones, a shuffled batch) read a volume beyond
+the cache at one or two misses per line of taps; sorted by bricks of 8³ coefficients they read every brick once. Sorting
+and putting rows back costs 20 to 30 ns per point. Measured for 10⁶ random float32 points, value + gradient, one thread
+(Zen 3, AVX2, a busy machine), ns per point as they lie → sorted, everything included:
+
+    volume     gather 3³ taps   gather 4³ taps   scatter 3³ taps   scatter 4³ taps
+     64³           17 → 38          32 → 38           30 → 39           41 → 50
+    128³           74 → 51         111 → 61          161 → 49          148 → 65
+    256³          143 → 74         222 → 71          190 → 71          224 → 98
+
+Memory: copies of the points and rows of `POINTS_AT_ONCE` points, 4 bytes more for each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from filterlab.ops.cpu import compiler, sorting
+from filterlab.ops.cpu.sorting import AXES, Job, Recipe
+
+FEWEST_POINTS = 1 << 16  # of a batch entry
+SMALLEST_VOLUME = 6 << 20  # bytes of one channel
+POINTS_AT_ONCE = 1 << 22  # points that are sorted together, for which copies of points and rows are held
+_EDGE = 8  # of a brick
+_MOST_BRICKS = 1 << 16
+_LOOKED_AT = 2048
+
+
+def pays(points: Tensor, volume_bytes: int) -> bool:
+    """Whether sorting points (N, M, 3) costs less than it saves; a channel of the volume has so many bytes."""
+    return points.shape[1] >= FEWEST_POINTS and volume_bytes >= SMALLEST_VOLUME and scattered(points)
+
+
+def scattered(points: Tensor) -> bool:
+    """Whether most points lie more than a brick from the one before: looked at in a few places."""
+    count = points.shape[1]
+    at = torch.linspace(0, count - 2, min(_LOOKED_AT, count - 1)).long()
+    steps = (points[:, at + 1] - points[:, at]).abs().amax(-1)
+    return bool((steps > _EDGE).double().mean() > 0.5)
+
+
+class Sorted:
+    """Some points sorted by bricks.
+
+    Args:
+        points: (M, 3), contiguous, in coordinates of the coefficients, M at least the lanes of a pack.
+        shape: (D, H, W) of the coefficients.
+        start: the coordinate of coefficient 0.
+        lanes: P.
+
+    Attributes:
+        points: (M, 3), sorted; the order within a brick is that of the points.
+    """
+
+    def __init__(self, points: Tensor, shape: tuple[int, int, int], start: int, lanes: int) -> None:
+        self.arithmetic, self.lanes = str(points.dtype).removeprefix("torch."), lanes
+        self.count = points.shape[0]
+        assert self.count >= lanes, f"{self.count} points are fewer than a pack of {lanes}"
+        edge = _EDGE
+        while math.prod(-(-n // edge) for n in shape) > _MOST_BRICKS:
+            edge *= 2
+        bricks = [-(-n // edge) for n in shape[::-1]]
+        self._begin = np.zeros(math.prod(bricks), np.int32)
+        self._rank = np.empty(self.count, np.int32)
+        moved = np.empty((self.count, 3), self.arithmetic)
+        job = self._job(points=points.data_ptr(), sorted=moved.ctypes.data, start=start, per_edge=1 / edge)
+        for axis, number, step in zip(AXES, bricks, (1, bricks[0], bricks[0] * bricks[1]), strict=True):
+            setattr(job, f"last_{axis}", number - 1)
+            setattr(job, f"step_{axis}", step)
+        self._run("count", job)
+        self._begin[:] = np.cumsum(self._begin) - self._begin
+        self._run("move", job)
+        self.points = torch.from_numpy(moved)
+
+    def restore(self, sorted_rows: Tensor, rows: Tensor) -> None:
+        """rows (J, M) = sorted_rows (J, M) in the order of the points; rows may be part of longer ones."""
+        self._exchange("restore", sorted_rows, rows)
+
+    def arrange(self, rows: Tensor, sorted_rows: Tensor) -> None:
+        """The reverse."""
+        self._exchange("arrange", sorted_rows, rows)
+
+    def _exchange(self, step: str, sorted_rows: Tensor, rows: Tensor) -> None:
+        job = self._job(
+            rows=rows.data_ptr(), sorted_rows=sorted_rows.data_ptr(), stride=rows.stride(0), row_count=rows.shape[0]
+        )
+        self._run(step, job)
+
+    def _job(self, **fields) -> Job:
+        return Job(brick=self._rank.ctypes.data, begin=self._begin.ctypes.data, count=self.count, chunks=1, **fields)
+
+    def _run(self, step: str, job: Job) -> None:
+        job.next = 0
+        run: Callable[[int], None] = compiler.compiled(Recipe(step, self.arithmetic, self.lanes))
+        run(sorting.ctypes.addressof(job))

@@ -1,0 +1,363 @@
+"""The sums over taps, written as vector code for any stencil: the heart of every fused operation.
+
+Letters, as in `ops.reference`: x, y, z along W, H, D; S taps per axis; u the local coordinate. P points are handled at
+a time: a *pack* is P numbers, one per point, and a point's place in it is its *lane* (`ops.cpu.lanes` explains the
+instructions). a, b, c number the weight functions along x, y, z that the stencil's products are made of: for a jet the
+derivatives of one kernel.
+
+What is written for one pack of points:
+
+    locate     x, y, z -> first taps (integers) and u             (3 packs -> 3 packs)
+    weigh      w[axis][function][t] = the weight of tap t, a polynomial in u
+    for every line of taps (z, y):
+        fetch      the coefficients of that line, for every lane: up to S packs
+        along x    line[a]       = Σ_x w[x][a][x] · tap x
+        along y    plane[a, b]  += w[y][b][y] · line[a]
+    along z        row[a, b, c] += w[z][c][z] · plane[a, b]       after every plane
+
+so that value and gradient of a 3×3×3 kernel cost 93 multiply-adds, not 27·4. `spread`, the adjoint of `contract`, runs
+the three sums backwards. Taps that a product has no weight for are neither read nor multiplied: NCRSI reads 32
+coefficients of its 4×4×4. Everything is written out but for the loop over planes of taps that look alike.
+
+The coefficients of one line lie together in memory, but a pack wants the first tap of every lane together, then the
+second tap of every lane. Collecting them one by one (a gather) is slow; instead every lane's line is read in one piece
+and the P×S table is transposed in registers. Four lanes a, b, c, d with four taps 0 1 2 3:
+
+    lines as read            pairs interleaved            halves joined
+    a0 a1 a2 a3    ─┐
+    b0 b1 b2 b3    ─┴─▶  a0 b0 a1 b1 │ a2 b2 a3 b3   ─┐   a0 b0 c0 d0   tap 0 of every lane
+    c0 c1 c2 c3    ─┐                                ─┼─▶ a1 b1 c1 d1   tap 1
+    d0 d1 d2 d3    ─┴─▶  c0 d0 c1 d1 │ c2 d2 c3 d3   ─┘   a2 b2 c2 d2   tap 2
+                                                          a3 b3 c3 d3   tap 3
+
+With P = 8 two such tables lie side by side in every register (lanes 0-3 and 4-7), with P = 16 four: a *group* is four
+lanes. Lines of two taps need one step less; lines of five and six are a line of four and the rest.
+
+Nothing outside the coefficients is touched: the first tap is clamped before it becomes an integer, NaN included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import groupby
+from types import SimpleNamespace
+
+from filterlab.ops.cpu.lanes import I32, I64, POINTER, Lanes, Storage, Value
+from filterlab.ops.stencil import Lowered
+
+Weights = list[list[list[Value | None]]]
+"""[axis][function][t]: the weight of tap t, a pack; None where the function has none."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How the coefficients of one channel lie in memory and in space, as values of the program.
+
+    Attributes:
+        width, height: W and H (64 bits).
+        start: coordinate of coefficient 0 along every axis (64 bits).
+        low, high: smallest and largest coordinate of a first tap along x, y, z (doubles).
+    """
+
+    width: Value
+    height: Value
+    start: Value
+    low: tuple[Value, Value, Value]
+    high: tuple[Value, Value, Value]
+
+    @classmethod
+    def of(cls, job: SimpleNamespace) -> Grid:
+        """From a job's fields of these names, low_x … high_z for the ends."""
+        low = job.low_x, job.low_y, job.low_z
+        return cls(job.width, job.height, job.start, low, (job.high_x, job.high_y, job.high_z))
+
+
+class Taps:
+    """Writes the sums of a stencil at the end of the current block. Make it before any loop: it reserves memory.
+
+    Args:
+        lanes: writer of instructions.
+        stencil: what is summed.
+        storage: how coefficients lie in memory; for `spread` in the type of the arithmetic.
+        grid: where they lie.
+    """
+
+    def __init__(self, lanes: Lanes, stencil: Lowered, storage: Storage, grid: Grid) -> None:
+        self.lanes, self.builder = lanes, lanes.builder
+        self.stencil, self.storage, self.grid = stencil, storage, grid
+        self.supports = stencil.supports
+        self._plane_weights = lanes.reserve(lanes.pack, self.supports[2] * len(stencil.functions[2]))
+
+    # --- where the points read, and with which weights ---
+
+    def locate(self, points: Sequence[Value]) -> tuple[Value, list[Value]]:
+        """Every lane's offset of its first tap, in bytes (64 bits), and its local coordinates u along x, y, z."""
+        e, b = self.lanes, self.builder
+        (x, y, z), u = zip(*self.cells(points), strict=True)
+        size = I64(self.storage.bytes)
+        line = b.add(b.mul(z, e.everywhere(b.trunc(self.grid.height, I32))), y)
+        line_size = e.widen(e.everywhere(b.trunc(b.mul(self.grid.width, size), I32)))
+        offset = b.add(b.mul(e.widen(line), line_size), b.mul(e.widen(x), e.everywhere(size)))
+        return offset, list(u)  # 64 bits from here on: volumes may be large
+
+    def cells(self, points: Sequence[Value]) -> list[tuple[Value, Value]]:
+        """Along x, y, z: every lane's first tap, counted from coefficient 0 (32 bits), and its u."""
+        return [self._locate(point, axis) for axis, point in enumerate(points)]
+
+    def _locate(self, x: Value, axis: int) -> tuple[Value, Value]:
+        """First tap (from 0) and local coordinate; the start is subtracted from integers, u keeps all its digits."""
+        e, b = self.lanes, self.builder
+        low, high = (e.everywhere(e.scalar(end[axis])) for end in (self.grid.low, self.grid.high))
+        shifted = e.subtract(x, e.constant(self.supports[axis] / 2 - 1))
+        base = e.clamp(e.floor(shifted), low, high)
+        u = e.multiply_add(shifted, e.constant(0), e.subtract(shifted, base))  # 0 · ∞ = NaN: no value at infinity
+        start = e.everywhere(b.trunc(self.grid.start, I32))
+        return b.sub(e.to_integer(base), start), u
+
+    def weigh(self, u: Sequence[Value]) -> Weights:
+        """The weights of all taps. Those along z are also kept in memory: the loop over planes reads them there."""
+        e = self.lanes
+        weights: Weights = [
+            [[e.polynomial(row, own) if any(row) else None for row in table] for table in functions]
+            for functions, own in zip(self.stencil.functions, u, strict=True)
+        ]
+        for function, taps in enumerate(weights[2]):
+            for z, weight in enumerate(taps):
+                if weight is not None:
+                    e.store(weight, self._plane_weight(I64(z), function))
+        return weights
+
+    def _plane_weight(self, z: Value, function: int) -> Value:
+        b = self.builder
+        index = b.add(b.mul(z, I64(len(self.stencil.functions[2]))), I64(function))
+        return self.lanes.advance(self._plane_weights, index, self.lanes.pack)
+
+    def addresses(self, offset: Value, volume: Value) -> list[Value]:
+        """Address of every lane's first tap, from the offsets that `locate` gives and the address of coefficient 0."""
+        b = self.builder
+        there = b.add(offset, self.lanes.everywhere(b.ptrtoint(volume, I64)))
+        return [b.inttoptr(b.extract_element(there, I32(lane)), POINTER) for lane in range(self.lanes.count)]
+
+    # --- the sums ---
+
+    def contract(self, taps: list[Value], here: Value, weights: Weights, u: Sequence[Value]) -> list[Value]:
+        """The rows of the stencil.
+
+        Args:
+            taps: address of every lane's first tap.
+            here: offset of the channel, in coefficients.
+            weights: of `weigh`.
+            u: of `locate`; rows that are zero everywhere are NaN where it is.
+        """
+        e = self.lanes
+        rows = [e.variable(e.constant(0)) for _ in self.stencil.rows]
+        for planes in self._alike():
+            with self._every(planes, here) as (plane_offset, wz):
+                sums: dict[tuple[int, int], Value] = {}
+                for y in range(self.supports[1]):
+                    self._contract_line(taps, plane_offset, y, weights, self._pairs(wz), sums)
+                for row, products in zip(rows, self.stencil.rows, strict=True):
+                    for c, weight in wz.items():
+                        if (total := self._combine(products, c, sums)) is not None:
+                            row.value = e.multiply_add(weight, total, row.value)
+        nothing = None
+        for own in u:
+            nothing = e.multiply_add(own, e.constant(0), nothing)
+        return [row.value if products else nothing for row, products in zip(rows, self.stencil.rows, strict=True)]
+
+    def _contract_line(
+        self,
+        taps: list[Value],
+        plane_offset: Value,
+        y: int,
+        weights: Weights,
+        pairs: list[tuple[int, int]],
+        sums: dict[tuple[int, int], Value],
+    ) -> None:
+        """Add line y of a plane to the sums over planes[a, b]."""
+        e = self.lanes
+        wx, wy, _ = weights
+        pairs = [(a, b) for a, b in pairs if wy[b][y] is not None]
+        needed = self._taps_of({a for a, _ in pairs})
+        if not needed:
+            return
+        values = self._fetch(self._line(taps, plane_offset, y), needed)
+        for a in sorted({a for a, _ in pairs}):
+            line = None
+            for x, value in zip(needed, values, strict=True):
+                if wx[a][x] is not None:
+                    line = e.multiply_add(wx[a][x], value, line)
+            for b in sorted({b for own, b in pairs if own == a}):
+                sums[a, b] = e.multiply_add(wy[b][y], line, sums.get((a, b)))
+
+    def _combine(self, products: Sequence[tuple], c: int, sums: dict[tuple[int, int], Value]) -> Value | None:
+        """Σ weight · plane[a, b] over the products of a row that have c along z."""
+        e, total = self.lanes, None
+        for weight, a, b, own in products:
+            if own == c and (a, b) in sums:
+                plane = sums[a, b]
+                if weight != 1 or total is not None:
+                    plane = e.multiply_add(e.constant(weight), plane, total)
+                total = plane
+        return total
+
+    def spread(self, taps: list[Value], here: Value, weights: Weights, cotangents: list[Value]) -> None:
+        """The three sums backwards: add every lane's cotangents (packs, one per row) into the coefficients."""
+        e = self.lanes
+        wx, wy, _ = weights
+        for planes in self._alike():
+            with self._every(planes, here) as (plane_offset, wz):
+                sums = self._spread_planes(wz, cotangents)
+                for y in range(self.supports[1]):
+                    lines: dict[int, Value] = {}
+                    for (a, b), plane in sums.items():
+                        if wy[b][y] is not None:
+                            lines[a] = e.multiply_add(wy[b][y], plane, lines.get(a))
+                    needed = self._taps_of(set(lines))
+                    values = []
+                    for x in needed:
+                        value = None
+                        for a, line in lines.items():
+                            if wx[a][x] is not None:
+                                value = e.multiply_add(wx[a][x], line, value)
+                        values.append(e.constant(0) if value is None else value)
+                    if needed:
+                        self._add_line(self._line(taps, plane_offset, y), needed, values)
+
+    def _spread_planes(self, wz: dict[int, Value], cotangents: list[Value]) -> dict[tuple[int, int], Value]:
+        e = self.lanes
+        sums: dict[tuple[int, int], Value] = {}
+        for products, cotangent in zip(self.stencil.rows, cotangents, strict=True):
+            for weight, a, b, c in products:
+                if c in wz:
+                    own = wz[c] if weight == 1 else e.multiply(wz[c], e.constant(weight))
+                    sums[a, b] = e.multiply_add(own, cotangent, sums.get((a, b)))
+        return sums
+
+    # --- which taps there are ---
+
+    def _alike(self) -> list[tuple[range, tuple[int, ...]]]:
+        """Runs of planes for which the same functions along z have a weight, with those functions."""
+        functions = range(len(self.stencil.functions[2]))
+        live = [tuple(c for c in functions if self.stencil.has(2, c, z)) for z in range(self.supports[2])]
+        runs = [(key, [z for z, _ in group]) for key, group in groupby(enumerate(live), key=lambda item: item[1])]
+        return [(range(planes[0], planes[-1] + 1), key) for key, planes in runs if key]
+
+    def _pairs(self, wz: dict[int, Value]) -> list[tuple[int, int]]:
+        """The distinct (a, b) of products that have one of these functions along z."""
+        return list(dict.fromkeys((a, b) for row in self.stencil.rows for _, a, b, c in row if c in wz))
+
+    def _taps_of(self, functions: set[int]) -> range:
+        """From the first to the last tap along x that one of the functions has a weight for."""
+        taps = [x for x in range(self.supports[0]) if any(self.stencil.has(0, a, x) for a in functions)]
+        return range(taps[0], taps[-1] + 1) if taps else range(0)
+
+    @contextmanager
+    def _every(self, planes: tuple[range, tuple[int, ...]], here: Value) -> Iterator[tuple[Value, dict[int, Value]]]:
+        """for z in planes: the with-block, given the offset of the plane's first tap and the weights along z.
+
+        The one loop over taps that is not unrolled: programs are S times shorter and compile S times faster.
+        """
+        e, b, grid = self.lanes, self.builder, self.grid
+        run, functions = planes
+        with e.repeat(I64(run.start), I64(run.stop)) as z:
+            own = {c: e.load(self._plane_weight(z, c), e.number, e.count) for c in functions}
+            yield e.opaque(b.add(here, b.mul(b.mul(z, grid.height), grid.width))), own
+
+    # --- lines of taps in memory ---
+
+    def _line(self, taps: list[Value], plane_offset: Value, y: int) -> list[Value]:
+        """Addresses of every lane's line y of taps."""
+        offset = self.lanes.opaque(self.builder.add(plane_offset, self.builder.mul(self.grid.width, I64(y))))
+        return [self.lanes.advance(tap, offset, self.storage.raw) for tap in taps]
+
+    def _fetch(self, lines: list[Value], taps: range) -> list[Value]:
+        """The first of these taps of every lane, the second of every lane, …"""
+        packs = []
+        for piece in _pieces(taps):
+            addresses = [self.lanes.advance(line, I64(piece.start), self.storage.raw) for line in lines]
+            packs += self._fetch_piece(addresses, len(piece))
+        return [self.lanes.convert(pack, self.storage) for pack in packs]
+
+    def _fetch_piece(self, lines: list[Value], taps: int) -> list[Value]:
+        e = self.lanes
+        if taps == 1:
+            return [self._join([e.load(line, self.storage.raw, 1) for line in lines])]
+        if taps == 2:
+            pairs = [e.load(line, self.storage.raw, 2) for line in lines]
+            return _transpose_pairs(e, [self._join(_lanes_of_groups(pairs, k)) for k in ((0, 1), (2, 3))])
+        quads = [e.load_quad(line, self.storage, taps) for line in lines]
+        return _transpose_quads(e, [self._join(_lanes_of_groups(quads, (k,))) for k in range(4)])[:taps]
+
+    def _join(self, vectors: list[Value]) -> Value:
+        """Vectors laid end to end; their number is a power of two."""
+        while len(vectors) > 1:
+            width = range(2 * vectors[0].type.count)
+            vectors = [self.lanes.shuffle(a, b, width) for a, b in zip(vectors[::2], vectors[1::2], strict=True)]
+        return vectors[0]
+
+    def _add_line(self, lines: list[Value], taps: range, values: list[Value]) -> None:
+        """Add to every lane's line of taps, one lane after the other: two lanes may share a coefficient."""
+        e, b = self.lanes, self.builder
+        for piece in _pieces(taps):
+            packs = values[piece.start - taps.start : piece.stop - taps.start]
+            for line, own in zip(lines, self._lines_of_lanes(packs), strict=True):
+                address = e.advance(line, I64(piece.start), self.storage.raw)
+                e.store(b.fadd(e.load(address, e.number, len(piece)), own), address)
+
+    def _lines_of_lanes(self, packs: list[Value]) -> list[Value]:
+        """The inverse of `_fetch_piece`: for every lane a vector of its taps."""
+        e, taps = self.lanes, len(packs)
+        if taps == 1:
+            return [e.shuffle(packs[0], packs[0], [i]) for i in range(e.count)]
+        if taps == 2:
+            joined = _interleave_pairs(e, packs)
+            return [e.shuffle(joined[i % 4 // 2], joined[i % 4 // 2], _places(i, 2)) for i in range(e.count)]
+        joined = _transpose_quads(e, [*packs, *[e.constant(0)] * (4 - taps)])
+        return [e.shuffle(joined[i % 4], joined[i % 4], _places(i, taps)) for i in range(e.count)]
+
+
+def _pieces(taps: range) -> list[range]:
+    """A line of taps in pieces of at most four."""
+    return [range(first, min(first + 4, taps.stop)) for first in range(taps.start, taps.stop, 4)]
+
+
+# --- transpositions; a group is four lanes --------------------------------------------------------------------------
+
+
+def _lanes_of_groups(vectors: list[Value], lanes: tuple[int, ...]) -> list[Value]:
+    """The vectors of those lanes of every group."""
+    return [vectors[group + k] for group in range(0, len(vectors), 4) for k in lanes]
+
+
+def _in_groups(e: Lanes, a: Value, b: Value, pattern: Sequence[int]) -> Value:
+    """A shuffle that does the same in every group: 0-3 are the lanes of a's group, 4-7 those of b's."""
+    return e.shuffle(a, b, [g + k if k < 4 else e.count + g + k - 4 for g in range(0, e.count, 4) for k in pattern])
+
+
+def _transpose_quads(e: Lanes, rows: list[Value]) -> list[Value]:
+    """Four registers, row k holding the four taps of lane k of every group -> tap k of every lane; its own inverse."""
+    a, b, c, d = rows
+    low = _in_groups(e, a, b, (0, 4, 1, 5)), _in_groups(e, c, d, (0, 4, 1, 5))  # a0 b0 a1 b1 and c0 d0 c1 d1
+    high = _in_groups(e, a, b, (2, 6, 3, 7)), _in_groups(e, c, d, (2, 6, 3, 7))  # a2 b2 a3 b3 and c2 d2 c3 d3
+    return [_in_groups(e, ab, cd, half) for ab, cd in (low, high) for half in ((0, 1, 4, 5), (2, 3, 6, 7))]
+
+
+def _transpose_pairs(e: Lanes, rows: list[Value]) -> list[Value]:
+    """a0 a1 b0 b1 and c0 c1 d0 d1 in every group -> tap 0 and tap 1 of every lane."""
+    ab, cd = rows
+    return [_in_groups(e, ab, cd, pattern) for pattern in ((0, 2, 4, 6), (1, 3, 5, 7))]
+
+
+def _interleave_pairs(e: Lanes, taps: list[Value]) -> list[Value]:
+    """The inverse of `_transpose_pairs`."""
+    first, second = taps
+    return [_in_groups(e, first, second, pattern) for pattern in ((0, 4, 1, 5), (2, 6, 3, 7))]
+
+
+def _places(lane: int, taps: int) -> range:
+    """Where the taps of a lane stand after the transposition into rows."""
+    first = lane // 4 * 4 + (2 * (lane % 2) if taps == 2 else 0)
+    return range(first, first + taps)

@@ -1,0 +1,353 @@
+"""The fused march: rays through coefficients, a transfer function and lights, to light and optical depth.
+
+Everything is prepared by the caller as plain tensors: rays cut to the volume, in coordinates of the coefficients; the
+tables of the transfer function; lights and halfway vectors of every ray. `ops.cpu.march` is the program. No derivatives
+are recorded here: `March.adjoint` computes them from what `March.run` gave.
+
+Memory beyond the result: 16 bytes per interval of the transfer function; for the adjoint 8 · (9 + 12 K) bytes per ray,
+K lights, and for derivatives by the coefficients one volume of them per thread (within `SPLAT_MEMORY`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from filterlab.ops import cpu
+from filterlab.ops.fused import STORAGE
+from filterlab.ops.stencil import Stencil
+
+if TYPE_CHECKING:
+    from filterlab.ops.cpu.march import Job
+
+MAX_LIGHTS = 8
+RAYS_AT_ONCE = 1 << 13  # then progress is reported, and Ctrl-C heard
+
+_RAYS_PER_BLOCK = 16
+_DARK = {torch.float32: 104.5, torch.float64: 746.0}  # optical depth from where e^−τ is 0
+_SLACK = {torch.float32: 2.0**-21, torch.float64: 2.0**-50}  # rounding of a point, relative to the coordinates
+
+
+@dataclass(frozen=True)
+class Rays:
+    """R rays inside the volume: points entry + t direction, 0 ≤ t ≤ length.
+
+    Attributes:
+        entry, direction: (R, 3) float64, in coordinates of the coefficients; the direction per world length.
+        length: (R,) float64, world lengths.
+        offset: (R,) float64: how far into a step the first segment reaches.
+        count: (R,) int64, segments.
+    """
+
+    entry: Tensor
+    direction: Tensor
+    length: Tensor
+    offset: Tensor
+    count: Tensor
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """M control points: positions (M,), colors (M, 3), opacities (M,) per `unit` world length."""
+
+    positions: Tensor
+    colors: Tensor
+    opacities: Tensor
+    unit: float
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """K lights.
+
+    Attributes:
+        ambient, shininess: numbers, ().
+        diffuse, specular: (K, 3) colours, times the weights of either kind of reflection.
+        toward, halfway: (R, K, 3) unit vectors l and h in the world.
+        world: (3, 3): gradient in the world = gradient by coordinates of the coefficients · world.
+    """
+
+    ambient: Tensor
+    shininess: Tensor
+    diffuse: Tensor
+    specular: Tensor
+    toward: Tensor
+    halfway: Tensor
+    world: Tensor
+
+    @property
+    def lights(self) -> int:
+        return self.diffuse.shape[0]
+
+
+@dataclass(frozen=True)
+class Bricks:
+    """Bricks of 2^edge cells along each axis; a point's cell is its first tap, counted from coefficient 0.
+
+    Attributes:
+        distance: (bz, by, bx) uint8: to the nearest brick that is not empty, in bricks along the axis where it is
+            farthest; `render.bricks` tells no more than 15 apart.
+    """
+
+    distance: Tensor
+    edge: int
+
+
+def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dtype, lights: int) -> str | None:
+    """What keeps the march from running here as asked; None: nothing does.
+
+    Args:
+        coefficients: (D, H, W).
+        stencil: value, and gradient when lit.
+        start: the coordinate of coefficient 0.
+        dtype: of the samples.
+        lights: K.
+    """
+    if lights > MAX_LIGHTS:
+        return f"up to {MAX_LIGHTS} lights; got {lights}"
+    points = torch.empty(1, 0, 3, dtype=dtype, device=coefficients.device)
+    return cpu.missing(coefficients.detach()[None, None], points, stencil, None, start)
+
+
+@dataclass(frozen=True)
+class March:
+    """A march and its adjoint. Tensors are in one dtype, float32 or float64, but for the rays (float64).
+
+    Attributes:
+        coefficients: (D, H, W), of any dtype that `ops.cpu` reads.
+        start: the coordinate of coefficient 0.
+        stencil: its rows are the value, and with lights the gradient.
+        rays, transfer, lighting: see there; lighting None: unlit.
+        step: world length of a segment.
+        faint: transmittance below which a ray ends; 0: where nothing passes any more.
+        bricks: which parts of the volume are empty; None: not known.
+    """
+
+    coefficients: Tensor
+    start: int
+    stencil: Stencil
+    rays: Rays
+    transfer: Transfer
+    lighting: Lighting | None
+    step: float
+    faint: float = 0.0
+    bricks: Bricks | None = None
+    _kept: list[object] = field(default_factory=list, repr=False)  # what jobs point to
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.transfer.positions.dtype
+
+    @torch.no_grad()
+    def run(self, report: Callable[[int], None] = lambda rays: None) -> tuple[Tensor, Tensor]:
+        """Light (R, 3) and optical depth (R,), float64. `report` is given the number of rays done, now and then."""
+        rays = self.rays.count.shape[0]
+        light = torch.zeros(rays, 3, dtype=torch.float64)
+        depth = torch.zeros(rays, dtype=torch.float64)
+        if rays:
+            job = self._job((), light=light, depth=depth)
+            self._launch((), job, report)
+        return light, depth
+
+    @torch.no_grad()
+    def adjoint(
+        self,
+        light: Tensor,
+        light_cotangent: Tensor,
+        depth_cotangent: Tensor,
+        wanted: Collection[str],
+        report: Callable[[int], None] = lambda rays: None,
+    ) -> dict[str, Tensor]:
+        """Derivatives of Σ light · its cotangent + Σ depth · its cotangent.
+
+        Args:
+            light: what `run` gave, (R, 3).
+            light_cotangent, depth_cotangent: (R, 3) and (R,), float64.
+            wanted: some of "coefficients", "rays", "table", "shading".
+            report: as for `run`.
+
+        Returns:
+            by name, in the shapes of what they belong to: for "coefficients" coefficients; for "rays" entry, direction,
+            length; for "table" positions, colors, opacities; for "shading" ambient, shininess, diffuse, specular,
+            toward, halfway. Float64 but for the coefficients' (the dtype of the march).
+
+        The same bits for one number of threads: every thread has rays of its own and adds into partial results of its
+        own, which are summed in order. Those by rays and shading do not depend on the threads at all.
+        """
+        from filterlab.ops.cpu.march import GRADIENTS, TABLE_ROW, gradient_columns
+
+        gradients = tuple(name for name in GRADIENTS if name in wanted)
+        rays, intervals = self.rays.count.shape[0], max(len(self.transfer.positions) - 1, 1)
+        lights = self.lighting.lights if self.lighting else None
+        columns = gradient_columns(lights)
+        threads = self._threads_of_adjoint("coefficients" in gradients)
+        by_ray = torch.zeros(rays, max(c.stop for c in columns.values()), dtype=torch.float64)
+        tables = torch.zeros(threads, intervals, TABLE_ROW, dtype=torch.float64)
+        volumes = []
+        if "coefficients" in gradients:
+            volumes = [cpu._fresh(self.coefficients.shape, self.dtype, np.zeros) for _ in range(threads)]
+        if rays:
+            cotangents = {"light_cotangent": light_cotangent, "depth_cotangent": depth_cotangent}
+            job = self._job(gradients, light=light, ray_gradient=by_ray, **cotangents)
+            own = [_copy(job) for _ in range(threads)]
+            for i, one in enumerate(own):
+                one.table_gradient = tables[i].data_ptr()
+                one.coefficient_gradient = volumes[i].data_ptr() if volumes else None
+            self._launch_parts(gradients, own, report)
+        for part in volumes[1:]:
+            volumes[0] += part
+        found: dict[str, Tensor] = {"coefficients": volumes[0]} if volumes else {}
+        if "rays" in gradients:
+            found |= {name: by_ray[:, columns[name]] for name in ("entry", "direction")}
+            found["length"] = by_ray[:, columns["length"]][:, 0]
+        if "table" in gradients:
+            found |= _of_tables(tables.sum(0), len(self.transfer.positions))
+        if "shading" in gradients and lights is not None:
+            found |= _of_shading(by_ray[:, columns["shading"]].sum(0), by_ray[:, columns["view"]], lights)
+        return found
+
+    def _threads_of_adjoint(self, with_volumes: bool) -> int:
+        """One for every so many rays, and no more volumes of derivatives than memory allows."""
+        threads = max(1, min(torch.get_num_threads(), self.rays.count.shape[0] // _RAYS_PER_BLOCK))
+        if with_volumes:
+            threads = min(threads, 1 + cpu.SPLAT_MEMORY // (self.coefficients.numel() * self.dtype.itemsize))
+        return threads
+
+    # --- jobs ---
+
+    def _job(self, gradients: tuple[str, ...], **arrays: Tensor) -> Job:
+        from filterlab.ops.cpu import march
+
+        d, h, w = self.coefficients.shape
+        job = march.Job(
+            width=w,
+            height=h,
+            start=self.start,
+            step=self.step,
+            block=_RAYS_PER_BLOCK,
+            per_unit=1 / self.transfer.unit,
+            faint=self.faint,
+            opaque=min(_DARK[self.dtype], -math.log(self.faint) if self.faint > 0 else math.inf),
+        )
+        for axis, size, support in zip(march.AXES, (w, h, d), self.stencil.supports, strict=True):
+            setattr(job, f"low_{axis}", self.start)
+            setattr(job, f"high_{axis}", self.start + size - support)
+        job.intervals = max(len(self.transfer.positions) - 1, 1)
+        inputs = {
+            "coefficients": self.coefficients,
+            **{name: getattr(self.rays, name) for name in ("entry", "direction", "length", "offset", "count")},
+            **_tables(self.transfer),
+            **(self._lit() if self.lighting else {}),
+            **arrays,
+        }
+        if self.bricks is not None:
+            inputs["bricks"] = self.bricks.distance
+            job.edge = self.bricks.edge
+            job.slack = _SLACK[self.dtype] * (abs(self.start) + max(d, h, w))
+            for axis, count in zip(march.AXES, self.bricks.distance.shape[::-1], strict=True):
+                setattr(job, f"bricks_{axis}", count)
+        for name, tensor in inputs.items():
+            tensor = tensor.detach().resolve_neg().contiguous()
+            self._kept.append(tensor)
+            setattr(job, name, tensor.data_ptr())
+        return job
+
+    def _lit(self) -> dict[str, Tensor]:
+        s = self.lighting
+        assert s is not None
+        numbers = torch.stack((s.ambient, s.shininess))
+        tints = torch.stack((s.diffuse, s.specular), 1).reshape(-1)
+        view = torch.stack((s.toward, s.halfway), 2)
+        return {"shading": torch.cat((numbers, tints)), "view": view, "world": s.world}
+
+    def _launch(self, gradients: tuple[str, ...], job: Job, report: Callable[[int], None]) -> None:
+        """Let the threads loose on one portion of the rays after the other."""
+        from filterlab.ops.cpu import compiler
+        from filterlab.ops.cpu import threads as pool
+
+        function = compiler.compiled(self._recipe(gradients))
+        rays = self.rays.count.shape[0]
+        for first in range(0, rays, RAYS_AT_ONCE):
+            job.first, job.last = first, min(first + RAYS_AT_ONCE, rays)
+            job.stride = job.chunks = -(-(job.last - first) // job.block)
+            job.next = 0
+            pool.run(function, [job] * max(1, min(torch.get_num_threads(), job.chunks)))
+            report(job.last)
+
+    def _launch_parts(self, gradients: tuple[str, ...], jobs: list[Job], report: Callable[[int], None]) -> None:
+        """The same with a job for every thread: thread i takes blocks i, i + threads, … of the rays."""
+        from filterlab.ops.cpu import compiler
+        from filterlab.ops.cpu import threads as pool
+
+        function = compiler.compiled(self._recipe(gradients))
+        rays = self.rays.count.shape[0]
+        for first in range(0, rays, RAYS_AT_ONCE):
+            for i, job in enumerate(jobs):
+                job.first, job.last = first, min(first + RAYS_AT_ONCE, rays)
+                job.next, job.chunks, job.stride = i, i + 1, len(jobs)
+            pool.run(function, jobs)
+            report(min(first + RAYS_AT_ONCE, rays))
+
+    def _recipe(self, gradients: tuple[str, ...]):
+        from filterlab.ops.cpu import compiler
+        from filterlab.ops.cpu.march import Recipe
+
+        raised = self.stencil.derivatives if "rays" in gradients else None
+        return Recipe(
+            gradients,
+            self.stencil.lowered,
+            None if raised is None else (raised[0].lowered, raised[1]),
+            self.lighting is not None,
+            self.lighting.lights if self.lighting else 0,
+            self.bricks is not None,
+            cpu._ARITHMETIC[self.dtype],
+            STORAGE[self.coefficients.dtype],
+            2 * cpu._lanes(compiler.features(), self.dtype.itemsize),
+        )
+
+
+def _copy(job: Job) -> Job:
+    return type(job).from_buffer_copy(job)
+
+
+def _of_tables(rows: Tensor, points: int) -> dict[str, Tensor]:
+    """Derivatives by both ends of every interval, (intervals, 12), as derivatives by the control points."""
+    by_point = rows.new_zeros(len(rows) + 1, 5)
+    by_point[:-1] += rows[:, 0:10:2]
+    by_point[1:] += rows[:, 1:10:2]
+    if points == 1:
+        by_point = by_point.sum(0, keepdim=True)
+        by_point[:, 0] = 0
+    return {"positions": by_point[:, 0], "opacities": by_point[:, 1], "colors": by_point[:, 2:]}
+
+
+def _of_shading(shading: Tensor, view: Tensor, lights: int) -> dict[str, Tensor]:
+    tints, vectors = shading[2:].reshape(lights, 2, 3), view.reshape(-1, lights, 2, 3)
+    return {
+        "ambient": shading[0],
+        "shininess": shading[1],
+        "diffuse": tints[:, 0],
+        "specular": tints[:, 1],
+        "toward": vectors[:, :, 0],
+        "halfway": vectors[:, :, 1],
+    }
+
+
+def _tables(transfer: Transfer) -> dict[str, Tensor]:
+    """The rows that the program reads, one per interval. A single control point: an interval without an end."""
+    x, rgb, alpha = (t.detach() for t in (transfer.positions, transfer.colors, transfer.opacities))
+    if len(x) == 1:
+        x = torch.stack((torch.zeros_like(x[0]), torch.full_like(x[0], math.inf)))
+        rgb, alpha = rgb.expand(2, 3), alpha.expand(2)
+    colors = torch.stack((rgb[:-1], rgb[1:]), -1).reshape(-1, 6)
+    return {
+        "inner": x[1:-1] if len(x) > 2 else x,
+        "opacities": torch.stack((x[:-1], x[1:], alpha[:-1], alpha[1:]), -1),
+        "colors": torch.cat((colors, colors.new_zeros(len(colors), 2)), -1),
+    }

@@ -1,0 +1,237 @@
+"""From samples to coefficients: the recursions of `prefilters`, as an operation that can be differentiated.
+
+`prefilter_axis` filters along one axis, `prefilter_samples` along x, y and z. Two implementations: "reference" is plain
+torch, one recursion after the other; "cpu" is fused vector code (`ops.cpu.recursion`). They agree to rounding.
+
+With E the extension of a line by its boundary's rule, F = Π gain Lᵀ L the recursions (L the causal one as a matrix) and
+C, which drops the warm-up at both ends, coefficients are c = C F E f. F is its own adjoint, so that of the whole is
+
+    Eᵀ F Cᵀ        pad with zeros, filter, add what stands beyond the ends to the samples that it was copied from:
+
+F again, under the boundary `zeros`, for which E and C only pad and crop. So derivatives of any order need nothing new.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from filterlab.ops import cpu
+from filterlab.ops.autograd import plain
+from filterlab.ops.fused import STORAGE
+from filterlab.prefilters import Prefilter, named
+from filterlab.volume import Boundary
+
+IMPLEMENTATIONS = ("reference", "cpu")
+_VOLUME = (-3, -2, -1)
+
+
+def missing(samples: Tensor) -> str | None:
+    """What keeps the implementation "cpu" from filtering these samples; None: nothing does."""
+    if problem := cpu._llvmlite_problem():
+        return problem
+    if samples.device.type != "cpu" or samples.layout != torch.strided:
+        return f"it works on dense tensors of the CPU; got {samples.layout} on {samples.device}"
+    if type(samples) not in (Tensor, torch.nn.Parameter):
+        return f"it reads memory, which a {type(samples).__name__} may not have"
+    if samples.dtype not in STORAGE:
+        return f"samples must be stored as {', '.join(STORAGE.values())}; got {samples.dtype}"
+    return None
+
+
+def implementation_for(samples: Tensor) -> str:
+    """The fastest implementation for these samples: "cpu" where it can run, else "reference"."""
+    return "reference" if torch.compiler.is_compiling() or missing(samples) else "cpu"
+
+
+def prefilter_axis(
+    samples: Tensor,
+    dim: int,
+    prefilter: str | Prefilter,
+    boundary: str | Boundary = Boundary.MIRROR,
+    tail: int = 0,
+    implementation: str = "reference",
+) -> Tensor:
+    """Coefficients along one axis.
+
+    Args:
+        samples: any shape, real. Integers, float16 and bfloat16 are filtered in float32. Never written to.
+        dim: the axis to filter.
+        prefilter: a name from `PREFILTERS` or a `Prefilter`.
+        boundary: how the samples go on beyond the ends.
+        tail: coefficients to return beyond each end (border and zeros need them; see the head of `prefilters`).
+        implementation: "reference" (plain torch) or "cpu" (fused; `missing` says what it needs).
+
+    Returns:
+        the coefficients, `samples.shape` with n + 2·tail along `dim`. Linear in the samples; differentiable any number
+        of times.
+
+    Raises:
+        ValueError: no such axis, or no samples along it; a negative tail; an unknown name; an implementation that can't
+            run here (the message says why).
+    """
+    if not -samples.ndim <= dim < samples.ndim:
+        raise ValueError(f"dim must be an axis of the samples, {-samples.ndim} … {samples.ndim - 1}; got {dim}")
+    dims = (dim % samples.ndim - samples.ndim,)
+    return _prefiltered(samples, dims, prefilter, boundary, tail, implementation)
+
+
+def prefilter_samples(
+    samples: Tensor,
+    prefilter: str | Prefilter,
+    boundary: str | Boundary = Boundary.MIRROR,
+    tail: int = 0,
+    implementation: str = "reference",
+) -> Tensor:
+    """Coefficients of a whole volume: `prefilter_axis` along x, y and z.
+
+    Args:
+        samples: (..., D, H, W), real.
+        prefilter, boundary, tail, implementation: as for `prefilter_axis`; the tail is kept along all three axes.
+
+    Returns:
+        (..., D + 2·tail, H + 2·tail, W + 2·tail), float64 for float64 samples, else float32. Under border and zeros
+        and with tail 0 these are the coefficients inside the volume only.
+
+    Raises:
+        ValueError: as `prefilter_axis`; fewer than three axes.
+    """
+    if samples.ndim < 3:
+        raise ValueError(f"samples must have shape (..., D, H, W); got {tuple(samples.shape)}")
+    return _prefiltered(samples, _VOLUME, prefilter, boundary, tail, implementation)
+
+
+def _prefiltered(
+    samples: Tensor,
+    dims: tuple[int, ...],
+    prefilter: str | Prefilter,
+    boundary: str | Boundary,
+    tail: int,
+    implementation: str,
+) -> Tensor:
+    prefilter, boundary = named(prefilter), Boundary.named(boundary)
+    if any(samples.shape[dim] == 0 for dim in dims):
+        raise ValueError(f"an axis that is filtered needs at least one sample; got shape {tuple(samples.shape)}")
+    if tail < 0:
+        raise ValueError(f"tail must be ≥ 0; got {tail}")
+    if implementation not in IMPLEMENTATIONS:
+        raise ValueError(f"implementation must be one of {', '.join(IMPLEMENTATIONS)}; got {implementation!r}")
+    if implementation == "cpu":
+        if why := missing(samples):
+            raise ValueError(f"implementation 'cpu' can't run here: {why}; implementation='reference' can")
+        if not prefilter.is_identity:
+            return _fused(samples, dims, prefilter, boundary, tail)
+    return _reference(samples, dims, prefilter, boundary, tail)
+
+
+# --- reference --------------------------------------------------------------------------------------------------------
+
+
+def _reference(samples: Tensor, dims: tuple[int, ...], prefilter: Prefilter, boundary: Boundary, tail: int) -> Tensor:
+    out = samples.to(torch.promote_types(samples.dtype, torch.float32))
+    warm_up = prefilter.decay(out.dtype)
+    for dim in dims:
+        lines = boundary.extend(out, dim, tail + warm_up, tail + warm_up).movedim(dim, 0).contiguous()
+        for pole in prefilter.poles:
+            lines = _two_sided_exponential(lines, pole)
+        out = lines[warm_up : lines.shape[0] - warm_up].movedim(0, dim)
+    return out
+
+
+class _TwoSidedExponential(torch.autograd.Function):
+    """A causal and an anticausal recursion along axis 0, both started from zero.
+
+    With L the causal one as a matrix this is y = (1−z)² Lᵀ L x: symmetric, so it is its own adjoint, exactly.
+    """
+
+    @staticmethod
+    def forward(x: Tensor, pole: float) -> Tensor:
+        y = x * (1 - pole) ** 2
+        rows = y.unbind(0)
+        for previous, row in pairwise(rows):
+            row.add_(previous, alpha=pole)
+        for following, row in pairwise(reversed(rows)):
+            row.add_(following, alpha=pole)
+        return y
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.pole = inputs[1]
+
+    @staticmethod
+    def backward(ctx, *gradients: Tensor):
+        return _two_sided_exponential(gradients[0], ctx.pole), None
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        return _two_sided_exponential(tangents[0], ctx.pole)
+
+    @staticmethod
+    def vmap(info, in_dims, x: Tensor, pole: float):
+        return _two_sided_exponential(x.movedim(in_dims[0], -1), pole), x.ndim - 1
+
+
+def _two_sided_exponential(x: Tensor, pole: float) -> Tensor:
+    return _TwoSidedExponential.apply(x, pole)  # type: ignore[return-value]
+
+
+# --- fused ------------------------------------------------------------------------------------------------------------
+
+
+class _Fused(torch.autograd.Function):
+    """(samples, dims, prefilter, boundary, tail) -> coefficients; dims are negative: a batch may stand before."""
+
+    @staticmethod
+    def forward(samples: Tensor, *settings) -> Tensor:
+        return _compute(samples, *settings)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        samples, *ctx.settings = inputs
+        ctx.shape = samples.shape
+
+    @staticmethod
+    def backward(ctx, *gradients: Tensor):
+        return _adjoint(gradients[0], ctx.shape, *ctx.settings), None, None, None, None
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        return _fused(tangents[0], *ctx.settings)
+
+    @staticmethod
+    def vmap(info, in_dims, samples: Tensor, *settings):
+        return _fused(samples.movedim(in_dims[0], 0), *settings), 0
+
+
+def _fused(samples: Tensor, *settings) -> Tensor:
+    if plain(samples):
+        return _compute(samples, *settings)
+    return _Fused.apply(samples, *settings)  # type: ignore[return-value]
+
+
+def _compute(samples: Tensor, dims: tuple[int, ...], prefilter: Prefilter, boundary: Boundary, tail: int) -> Tensor:
+    from filterlab.ops.cpu import prefilter as fused  # it needs llvmlite
+
+    return fused.filter_axes(samples, dims, prefilter, boundary, tail)
+
+
+def _adjoint(
+    cotangents: Tensor, shape: torch.Size, dims: tuple[int, ...], prefilter: Prefilter, boundary: Boundary, tail: int
+) -> Tensor:
+    """Back to the shape of the samples. Memory: the cotangents with `prefilter.decay` voxels more on every side."""
+    if boundary is Boundary.ZEROS:
+        return _fused(cotangents, dims, prefilter, boundary, -tail)
+    beyond = prefilter.decay(cotangents.dtype)
+    out = _fused(cotangents, dims, prefilter, Boundary.ZEROS, beyond)
+    for dim in dims:
+        out = _fold(out, dim, boundary, shape[dim], tail + beyond)
+    return out
+
+
+def _fold(x: Tensor, dim: int, boundary: Boundary, n: int, beyond: int) -> Tensor:
+    """The adjoint of `boundary.extend(·, dim, beyond, beyond)` of n samples."""
+    outside = torch.cat((torch.arange(-beyond, 0, device=x.device), torch.arange(n, n + beyond, device=x.device)))
+    ends = torch.cat((x.narrow(dim, 0, beyond), x.narrow(dim, beyond + n, beyond)), dim)
+    return x.narrow(dim, beyond, n).index_add(dim, boundary.source(outside, n), ends)

@@ -1,0 +1,107 @@
+"""What the fused march is made of: exponentials and logarithms on packs, and the program's own promises."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from llvmlite import ir
+
+from filterlab.kernels import LINEAR, TensorKernel, bspline
+from filterlab.ops import Stencil, march
+from filterlab.ops.cpu import compiler, frame, mathematics
+from filterlab.ops.cpu.lanes import I64, POINTER, Lanes
+
+LANES = {"float32": 8, "float64": 4}
+
+
+@dataclass(frozen=True)
+class OnPacks:
+    """A program that applies a function of `mathematics` to an array: {source, target, count}."""
+
+    name: str
+    arithmetic: str
+
+    def generate(self) -> str:
+        module, function = frame.new_module()
+        b = ir.IRBuilder(function.append_basic_block("entry"))
+        e = Lanes(b, self.arithmetic, LANES[self.arithmetic])
+        source, target = (b.load(e.advance(function.args[0], I64(i), I64), typ=POINTER) for i in range(2))
+        count = b.load(e.advance(function.args[0], I64(2), I64), typ=I64)
+        with e.repeat(I64(0), count, e.count) as i:
+            x = e.load(e.advance(source, i, e.number), e.number, e.count)
+            if self.name == "power":
+                y, _ = mathematics.power(e, x, e.constant(7.5))
+            else:
+                y = getattr(mathematics, self.name)(e, x)
+            e.store(y, e.advance(target, i, e.number))
+        b.ret_void()
+        return str(module)
+
+
+def on_packs(name: str, x: np.ndarray) -> np.ndarray:
+    assert x.size % 8 == 0
+    out = np.empty_like(x)
+    job = (ctypes.c_int64 * 3)(x.ctypes.data, out.ctypes.data, x.size)
+    compiler.compiled(OnPacks(name, str(x.dtype)))(ctypes.addressof(job))
+    return out
+
+
+def arguments(dtype: str, rng: np.random.Generator) -> np.ndarray:
+    """Any bit pattern; the range that matters, evenly; close to 0 and 1; the ends."""
+    bits = rng.integers(0, 2**32 if dtype == "float32" else 2**64, 40_000, dtype=f"u{4 if dtype == 'float32' else 8}")
+    edge = 110 if dtype == "float32" else 760
+    near = np.exp(rng.uniform(-40, 0, 8_000))
+    ends = [0, -0.0, np.inf, -np.inf, np.nan, 1, -1, -1.5, 2, 0.5, 0.7071, 88.72, 88.73, 709.78, 709.79, -708.4]
+    parts = (rng.uniform(-edge, edge, 40_000), near, -near, 1 - near, near - 1, 1 + near, ends)
+    return np.concatenate([np.asarray(x, dtype) for x in parts] + [bits.view(dtype)])
+
+
+EXACT = {"exp": np.exp, "expm1": np.expm1, "log": np.log, "log1p": np.log1p}
+WORST = {"exp": 1.0, "expm1": 1.9, "log": 0.9, "log1p": 1.4}  # as the docstring says
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("name", EXACT)
+def test_functions_on_packs(name: str, dtype: str, rng: np.random.Generator) -> None:
+    with np.errstate(all="ignore"):
+        x = arguments(dtype, rng)
+        y = on_packs(name, x)
+        exact = EXACT[name](x.astype(np.longdouble))  # where a long double is a double, its error counts as ours
+        rounded = exact.astype(dtype)
+        errors = np.abs(y.astype(np.longdouble) - exact) / np.spacing(np.abs(rounded)).astype(np.longdouble)
+        ours = WORST[name] if np.finfo(np.longdouble).eps < 1e-17 or dtype == "float32" else WORST[name] + 0.6
+        denormal = (np.abs(rounded) < np.finfo(dtype).tiny) & (name == "expm1")
+        finite = np.isfinite(rounded) & ~denormal
+    assert finite.sum() > 10_000
+    assert errors[finite].max() <= ours
+    assert errors[denormal].max(initial=0) <= 1
+    special = ~np.isfinite(rounded)
+    assert special.sum() > 100
+    np.testing.assert_array_equal(y[special], rounded[special])
+
+
+def test_power_of_what_shading_needs(rng: np.random.Generator) -> None:
+    for dtype, tolerance in (("float32", 3e-7), ("float64", 5e-16)):
+        base = np.concatenate([[0.0, 1.0], rng.uniform(0, 1, 8_000), np.exp(rng.uniform(-60, 0, 1_998))]).astype(dtype)
+        power = on_packs("power", base)
+        assert power[0] == 0
+        assert power[1] == 1
+        np.testing.assert_allclose(power, base.astype(np.float64) ** 7.5, rtol=0, atol=tolerance)
+
+
+def test_missing_says_what() -> None:
+    volume, jet = torch.zeros(4, 4, 4), Stencil.jet(LINEAR, 1)
+
+    def why(volume=volume, stencil=jet, dtype=torch.float32, lights=1) -> str | None:
+        return march.missing(volume, stencil, 0, dtype, lights)
+
+    assert why() is None
+    assert "up to 8 lights; got 9" in str(why(lights=9))
+    assert "TensorKernel" in str(why(stencil=Stencil.jet(TensorKernel("b", torch.ones(2, 1)), 0)))
+    assert "supports go up to 6; got 7" in str(why(stencil=Stencil.jet(bspline(6), 0)))
+    assert "got torch.int64" in str(why(volume=torch.zeros(4, 4, 4, dtype=torch.int64)))
+    assert "got torch.float16" in str(why(dtype=torch.float16))
