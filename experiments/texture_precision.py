@@ -107,7 +107,7 @@ class Config(ExperimentConfig):
     @model_validator(mode="after")
     def _sampled(self) -> Config:
         for recipe in [*self.methods, *self.image_methods]:
-            if (recipe.scheme, recipe.sampler) != ("direct", "exact"):
+            if (recipe.scheme, recipe.sampler) != (None, "exact"):
                 raise ValueError(f"{recipe.key}: every scheme and sampler is measured; leave them out")
             if "eight_trilinear" not in fl.METHODS[recipe.method].facts.schemes:
                 offering = [m for m, method in fl.METHODS.items() if "eight_trilinear" in method.facts.schemes]

@@ -5,6 +5,7 @@ import json
 import math
 import re
 import struct
+from copy import deepcopy
 
 import nibabel
 import numpy as np
@@ -76,6 +77,24 @@ def tiny(name, scan):
                 {"title": "scan", "volume": str(scan)},
             ],
             "points": 200,
+        },
+        "inverse_dvr": {
+            "signal": "gaussian",
+            "resolution": 4,
+            "methods": ["trilinear"],
+            "views": {"training": 2, "held_out": 1, "size": 6, "shown": 6},
+            "volume": {
+                "transfer": VIEW["transfer"],
+                "stages": [{"resolution": 4, "iterations": 2, "learning_rate": 0.1}],
+                "rays": 20,
+            },
+            "transfer_function": {
+                "target": deepcopy(VIEW["transfer"]),  # else YAML writes an alias
+                "points": 3,
+                "iterations": 2,
+                "learning_rate": 0.1,
+                "rays": 20,
+            },
         },
     }
     parts = {n: {"experiment": n, "description": f"tiny {n}", **c} for n, c in configs.items()}
