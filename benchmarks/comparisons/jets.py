@@ -1,0 +1,96 @@
+"""Value and gradient: the fused sum against plain torch and against eight trilinear samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from benchmarks import workloads
+from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item
+from benchmarks.records import at_most
+from benchmarks.settings import Settings
+from filterlab import ops
+from filterlab.methods import METHODS, reconstruct
+
+# key: method, kind of gradient (None: the method's own)
+_CASES: dict[str, tuple[str, str | None]] = {
+    "triquadratic": ("triquadratic", None),
+    "tricubic": ("tricubic", None),
+    "notch": ("notch", None),
+    "mitchell": ("mitchell", None),
+    "trilinear": ("trilinear", None),
+    "trilinear-central": ("trilinear", "central"),
+    "ncrsi": ("ncrsi", None),
+}
+_IMPLEMENTATIONS = {"fused": "cpu", "direct": "reference"}
+_BARS = {"triquadratic-coherent": at_most("1/25")}
+
+
+def field_contestant(
+    method: str,
+    scheme: str,
+    volume: Tensor,
+    where: Tensor,
+    *,
+    gradient: str | None = None,
+    name: str | None = None,
+    computes: str | None = "value and gradient",
+) -> Contestant:
+    """value_and_gradient of a field of that scheme: boundary, folding of points and all."""
+    field = reconstruct(volume, method, scheme=scheme, gradient=gradient)
+    return Contestant(name or scheme, lambda: field.value_and_gradient(where), computes, samples=len(where))
+
+
+def op_contestant(
+    method: str, scheme: str, volume: Tensor, where: Tensor, computes: str | None = "value and gradient of the op"
+) -> Contestant:
+    """`ops.jet` of order 1 of a method's kernel on bare coefficients: no boundary, no folding."""
+    (term,) = METHODS[method].value_terms
+    coefficients, located = volume[None, None], where[None]
+
+    def call() -> Tensor:
+        return ops.jet(coefficients, located, term.kernels, 1, 0, _IMPLEMENTATIONS[scheme])
+
+    return Contestant(f"op {scheme}", call, computes, lambda rows: (rows[0, 0, 0], rows[0, 0, 1:]), len(where))
+
+
+def schemes_of(method: str, gradient: str | None) -> Sequence[str]:
+    """The schemes that give a method that kind of gradient, the fused one first."""
+    m = METHODS[method]
+    sampled = m.sampled is not None and (gradient or m.gradients[0]) == m.sampled_gradient
+    return ("fused", "direct", "eight_trilinear") if sampled else ("fused", "direct")
+
+
+def _race(settings: Settings, case: str, arrangement: str) -> Race:
+    method, gradient = _CASES[case]
+    volume = workloads.noise(settings.voxels)
+    where = workloads.points(arrangement, settings.voxels, settings.points)
+    schemes = schemes_of(method, gradient)
+    contestants = [field_contestant(method, s, volume, where, gradient=gradient) for s in schemes]
+    bar = _BARS.get(f"{case}-{arrangement}")
+    ratios = [Ratio("fused", other, bar if other == "direct" else None) for other in schemes[1:]]
+    if len(METHODS[method].value_terms) == 1 and gradient is None:
+        contestants += [op_contestant(method, s, volume, where) for s in ("fused", "direct")]
+        ratios.append(Ratio("op fused", "op direct", bar))
+    kind = f"{gradient or METHODS[method].gradients[0]} gradient"
+    return Race(f"{method} value + {kind}, {_at(settings, arrangement)}", contestants, ratios, tolerance=2e-5)
+
+
+def _at(settings: Settings, arrangement: str) -> str:
+    """The workload in words."""
+    order = "along rays" if arrangement == "coherent" else "at random"
+    return f"{settings.points:,} points {order}, {settings.voxels}³ float32"
+
+
+def _items(settings: Settings) -> list[Item]:
+    return [
+        race_item(f"{case}-{arrangement}", 15, lambda s, case=case, order=arrangement: _race(s, case, order))
+        for case in _CASES
+        for arrangement in workloads.ARRANGEMENTS
+    ]
+
+
+COMPARISON = Comparison(
+    "jets", "value + gradient: fused against the plain sum and eight trilinear samples, as an op and as a field", _items
+)

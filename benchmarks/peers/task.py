@@ -1,0 +1,36 @@
+"""What a peer is asked to compute, and whether it is there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """What is asked of a library: a kernel summed over coefficients, at points.
+
+    Attributes:
+        kernel: "linear", "bspline2", "bspline3", or "keys": cubic convolution with the slope −¾ that torch uses.
+        gradient: with the gradient, or the value alone.
+        coefficients: (n, n, n) float32.
+        points: (M, 3) float32 voxel coordinates x, y, z, a few voxels inside.
+        threads: how many it may use.
+    """
+
+    kernel: str
+    gradient: bool
+    coefficients: Tensor
+    points: Tensor
+    threads: int
+
+    @property
+    def computes(self) -> str:
+        return "value and gradient" if self.gradient else "value"
+
+
+def without(package: str, install: str | None = None) -> str | None:
+    """Why a package can't be imported, or None."""
+    return None if find_spec(package) else f"not installed: pip install {install or package}"

@@ -1,0 +1,103 @@
+"""Measurements that need a process of their own: peak memory, and the first call of a kernel.
+
+`measured` starts `python -m benchmarks.probe NAME ARGUMENTS` and reads the line of JSON that it prints.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+LIMIT = 1200  # seconds
+
+
+class ProbeError(RuntimeError):
+    """The process failed."""
+
+
+def measured(name: str, environment: Mapping[str, str] | None = None, **arguments: Any) -> dict[str, float]:
+    """What the measurement of that name finds in a fresh process.
+
+    Raises:
+        ProbeError: it ended with an error; the message has its last line.
+    """
+    paths = os.pathsep.join([str(Path(__file__).resolve().parents[1]), *filter(None, sys.path)])
+    inherited = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}  # else every import compiles
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.probe", name, json.dumps(arguments)],
+        env={**inherited, "PYTHONPATH": paths, **(environment or {})},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+        check=False,
+    )
+    if done.returncode:
+        raise ProbeError(f"{name}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def memory(threads: int, voxels: int, size: int, steps: int) -> dict[str, float]:
+    """Peak bytes before and after an image of `steps` steps a ray and its gradients."""
+    import torch
+
+    torch.set_num_threads(threads)
+    _image_and_gradients(voxels, 2, 4)  # whatever is loaded, compiled and pooled at first use
+    before = _peak()
+    _image_and_gradients(voxels, size, steps)
+    return {"before": before, "peak": _peak()}
+
+
+def _image_and_gradients(voxels: int, size: int, steps: int) -> None:
+    """Seen along an axis, so that every ray takes as many steps."""
+    import torch
+
+    from benchmarks.scene import marschner_lobb
+    from filterlab.render import OrthographicCamera, render
+
+    scene = marschner_lobb(voxels, size)
+    scene = replace(scene, volume=scene.volume.requires_grad_(), table=scene.table.requires_grad_())
+    center = (voxels - 1) / 2
+    camera = OrthographicCamera(position=(center, -voxels, center), target=(center,) * 3, height=0.9 * voxels)
+    field = scene.field("triquadratic", "fused")
+    image = render(field, camera, scene.transfer, size=(size, size), step=voxels / steps, shading=scene.shading)
+    torch.autograd.grad(image.mean(), (scene.volume, scene.table))
+
+
+def _peak() -> float:
+    """The most memory this process has had, in bytes."""
+    if sys.platform == "linux":  # ru_maxrss would be that of the process that started this one, where that had more
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return 1024.0 * int(status.split("VmHWM:")[1].split()[0])
+    import resource
+
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)  # bytes on macOS
+
+
+def first_call(methods: list[str]) -> dict[str, float]:
+    """Seconds of the first value and gradient of each fused kernel, one after the other, and of another of the last."""
+    import torch
+
+    from filterlab import ops
+    from filterlab.methods import METHODS
+
+    torch.set_num_threads(1)
+    coefficients, points = torch.rand(1, 1, 8, 8, 8), torch.full((1, 16, 3), 3.5)
+
+    def call(method: str) -> float:
+        (term,) = METHODS[method].value_terms
+        start = time.perf_counter()
+        ops.jet(coefficients, points, term.kernels, 1, 0, "cpu")
+        return time.perf_counter() - start
+
+    return {method: call(method) for method in methods} | {"again": call(methods[-1])}
+
+
+if __name__ == "__main__":
+    print(json.dumps({"memory": memory, "first_call": first_call}[sys.argv[1]](**json.loads(sys.argv[2]))))
