@@ -15,7 +15,6 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -191,7 +190,7 @@ class March:
         tables = torch.zeros(threads, intervals, TABLE_ROW, dtype=torch.float64)
         volumes = []
         if "coefficients" in gradients:
-            volumes = [cpu._fresh(self.coefficients.shape, self.dtype, np.zeros) for _ in range(threads)]
+            volumes = [cpu._zeros((1, *self.coefficients.shape), self.dtype)[0] for _ in range(threads)]
         if rays:
             cotangents = {"light_cotangent": light_cotangent, "depth_cotangent": depth_cotangent}
             job = self._job(gradients, light=light, ray_gradient=by_ray, **cotangents)

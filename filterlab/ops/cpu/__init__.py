@@ -110,10 +110,10 @@ def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequenc
     threads = _useful_threads(points)
     parts = min(threads, 1 + SPLAT_MEMORY // (volume * points.element_size() or 1))
     parts = max(1, min(parts, 8 * n * c * points.shape[1] // (volume or 1)))
-    out = _fresh((n, c, *shape), points.dtype, np.zeros)
+    out = _zeros((n, c, *shape), points.dtype)
     if not (cotangents.numel() and volume):
         return out
-    more = [_fresh(out.shape, out.dtype, np.zeros) for _ in range(parts - 1)]
+    more = [_zeros(out.shape, out.dtype) for _ in range(parts - 1)]
     cotangents, points = readable(cotangents.to(points.dtype), 0), readable(points, 1)
     if not _sorting_pays(points, out.shape, points.element_size()):
         _run("scatter", [out, *more], points, cotangents, stencil, start)
@@ -126,7 +126,7 @@ def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequenc
             _run("scatter", own, ordered.points[None], rows, stencil, start)
     for part in more:
         out += part
-    return out
+    return out.contiguous()
 
 
 def pull(coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
@@ -237,6 +237,17 @@ def _fresh(shape: Sequence[int], dtype: torch.dtype, make: Callable[..., np.ndar
     return torch.from_numpy(make(tuple(shape), _ARITHMETIC[dtype]))
 
 
+def _zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
+    """What scatter adds into, (N, ...), with room for one number behind every entry: three taps are added as four.
+
+    Threads may work on two entries of one volume at a time, so that the room of one may not be part of the next.
+    """
+    entry = np.empty(shape[1:], _ARITHMETIC[dtype])
+    memory = np.zeros(shape[0] * (entry.size + 1), entry.dtype)
+    strides = ((entry.size + 1) * entry.itemsize, *entry.strides)
+    return torch.from_numpy(np.ndarray(tuple(shape), entry.dtype, memory, 0, strides))
+
+
 def _run(
     operation: str,
     volumes: Sequence[Tensor],
@@ -252,7 +263,7 @@ def _run(
     Args:
         operation: "gather", "scatter" or "pull".
         volumes: for gather and pull the coefficients, as often as there are threads: all of them share the work, chunk
-            by chunk. For scatter as many volumes of zeros: each is given an equal share of the points.
+            by chunk. For scatter as many volumes of `_zeros`: each is given an equal share of the points.
         points, stencil, start: as for `gather`.
         rows: (N, C, J, M), contiguous; written by gather, read by scatter and pull.
         raised, gradient: for pull, as in its recipe and its result.

@@ -2,13 +2,22 @@
 
 Points along rays are in such an order already. Points that are not (random ones, a shuffled batch) read a volume beyond
 the cache at one or two misses per line of taps; sorted by bricks of 8³ coefficients they read every brick once. Sorting
-and putting rows back costs 20 to 30 ns per point. Measured for 10⁶ random float32 points, value + gradient, one thread
-(Zen 3, AVX2, a busy machine), ns per point as they lie → sorted, everything included:
+and putting rows back costs 8 to 30 ns per point. Measured for 10⁶ random float32 points, value + gradient, one thread,
+ns per point as they lie → sorted, everything included:
 
-    volume     gather 3³ taps   gather 4³ taps   scatter 3³ taps   scatter 4³ taps
-     64³           17 → 38          32 → 38           30 → 39           41 → 50
-    128³           74 → 51         111 → 61          161 → 49          148 → 65
-    256³          143 → 74         222 → 71          190 → 71          224 → 98
+                     gather 3³ taps   gather 4³ taps   scatter 3³ taps   scatter 4³ taps
+    Zen 5, AVX-512, 32 MB of last cache
+     64³                5 → 13           11 → 15          10 → 14           14 → 17
+    128³                8 → 20           17 → 23          22 → 24           32 → 28
+    192³               29 → 26           38 → 28          40 → 30           62 → 32
+    256³               34 → 30           51 → 32          46 → 34           73 → 41
+    384³               39 → 41           58 → 42          58 → 52           89 → 55
+    Zen 3, AVX2, a busy machine
+     64³               17 → 38           32 → 38          30 → 39           41 → 50
+    128³               74 → 51          111 → 61         161 → 49          148 → 65
+    256³              143 → 74          222 → 71         190 → 71          224 → 98
+
+The line is drawn between 128³ and 192³: what the caches hold of a volume is the machine's, and its neighbours'.
 
 Memory: copies of the points and rows of `POINTS_AT_ONCE` points, 4 bytes more for each.
 """
@@ -26,7 +35,7 @@ from filterlab.ops.cpu import compiler, sorting
 from filterlab.ops.cpu.sorting import AXES, Job, Recipe
 
 FEWEST_POINTS = 1 << 16  # of a batch entry
-SMALLEST_VOLUME = 6 << 20  # bytes of one channel
+SMALLEST_VOLUME = 16 << 20  # bytes of one channel
 POINTS_AT_ONCE = 1 << 22  # points that are sorted together, for which copies of points and rows are held
 _EDGE = 8  # of a brick
 _MOST_BRICKS = 1 << 16
