@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -29,6 +30,8 @@ MAX_LIGHTS = 8
 RAYS_AT_ONCE = 1 << 13  # then progress is reported, and Ctrl-C heard
 
 _RAYS_PER_BLOCK = 16
+_FEWEST_BUCKETED = 16  # inner control points; fewer are compared one by one
+_MOST_BUCKETS = 1 << 12
 _DARK = {torch.float32: 104.5, torch.float64: 746.0}  # optical depth from where e^−τ is 0
 _SLACK = {torch.float32: 2.0**-21, torch.float64: 2.0**-50}  # rounding of a point, relative to the coordinates
 
@@ -59,6 +62,25 @@ class Transfer:
     colors: Tensor
     opacities: Tensor
     unit: float
+
+    @cached_property
+    def buckets(self) -> Buckets | None:
+        """Which intervals values are in, by buckets of equal width; None where comparing is as fast."""
+        return _buckets(self.positions.detach(), self.opacities.detach())
+
+
+@dataclass(frozen=True)
+class Buckets:
+    """Value v is in bucket (v − low) · scale, rounded down, between the first and the last.
+
+    Attributes:
+        rows: (B, 8), see `ops.cpu.optics`.
+        low, scale: numbers of the dtype of rows.
+    """
+
+    rows: Tensor
+    low: float
+    scale: float
 
 
 @dataclass(frozen=True)
@@ -245,6 +267,9 @@ class March:
             **(self._lit() if self.lighting else {}),
             **arrays,
         }
+        if (buckets := self.transfer.buckets) is not None:
+            inputs["buckets"] = buckets.rows
+            job.bucket_low, job.bucket_scale, job.bucket_last = buckets.low, buckets.scale, len(buckets.rows) - 1
         if self.bricks is not None:
             inputs["bricks"] = self.bricks.distance
             job.edge = self.bricks.edge
@@ -305,6 +330,7 @@ class March:
             self.lighting is not None,
             self.lighting.lights if self.lighting else 0,
             self.bricks is not None,
+            self.transfer.buckets is not None,
             cpu._ARITHMETIC[self.dtype],
             STORAGE[self.coefficients.dtype],
             2 * cpu._lanes(compiler.features(), self.dtype.itemsize),
@@ -336,6 +362,27 @@ def _of_shading(shading: Tensor, view: Tensor, lights: int) -> dict[str, Tensor]
         "toward": vectors[:, :, 0],
         "halfway": vectors[:, :, 1],
     }
+
+
+def _buckets(x: Tensor, alpha: Tensor) -> Buckets | None:
+    """As few buckets as have no more than one inner control point each, at most `_MOST_BUCKETS`."""
+    inner = x[1:-1]
+    if len(inner) < _FEWEST_BUCKETED:
+        return None
+    count = 1 << len(inner).bit_length()
+    while count <= _MOST_BUCKETS:
+        low, scale = inner[0], (count - 1) / (inner[-1] - inner[0])
+        if not 0 < scale < math.inf:
+            return None
+        own = ((inner - low) * scale).clamp(0, count - 1).long()
+        if bool((own.diff() > 0).all()):
+            numbers = torch.arange(int(own[-1]) + 1)  # the last one has the last inner control point
+            first = torch.searchsorted(own, numbers)  # inner control points before the bucket
+            ends = torch.stack([t[(first + k).clamp_max(len(x) - 1)] for t in (x, alpha) for k in range(3)], -1)
+            rows = torch.cat((ends[:, :3], first[:, None].to(x.dtype), ends[:, 3:], torch.zeros_like(ends[:, :1])), -1)
+            return Buckets(rows, float(low), float(scale))
+        count *= 2
+    return None
 
 
 def _tables(transfer: Transfer) -> dict[str, Tensor]:

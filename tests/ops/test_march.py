@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,3 +106,32 @@ def test_missing_says_what() -> None:
     assert "supports go up to 6; got 7" in str(why(stencil=Stencil.jet(bspline(6), 0)))
     assert "got torch.int64" in str(why(volume=torch.zeros(4, 4, 4, dtype=torch.int64)))
     assert "got torch.float16" in str(why(dtype=torch.float16))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("spacing", ["equal", "random", "clustered"])
+def test_buckets_find_the_interval_that_comparing_finds(spacing: str, dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(3)
+    x = {
+        "equal": torch.linspace(-1, 2, 129, dtype=torch.float64),
+        "random": torch.rand(40, generator=generator, dtype=torch.float64).sort().values,
+        "clustered": torch.cat((torch.linspace(0, 1e-6, 20, dtype=torch.float64), torch.tensor([1.0, 2.0]))),
+    }[spacing].to(dtype)
+    alpha = torch.rand(len(x), generator=generator).to(dtype)
+    buckets = march._buckets(x, alpha)
+    if spacing == "clustered":
+        assert buckets is None  # compared one by one
+        return
+    assert buckets is not None
+    near = torch.cat([torch.nextafter(x, torch.full_like(x, to)) for to in (-math.inf, math.inf)])
+    wild = torch.tensor([math.nan, math.inf, -math.inf, 1e30, -1e30], dtype=dtype)
+    v = torch.cat((x, near, wild, torch.rand(5000, generator=generator).to(dtype) * 4 - 1.5))
+    number = ((v - buckets.low) * buckets.scale).nan_to_num(0).clamp(0, len(buckets.rows) - 1).long()
+    row = buckets.rows[number]
+    beyond = (v >= row[:, 1]).long()
+    found = row[:, 3].long() + beyond
+    expected = (v[:, None] >= x[1:-1]).sum(-1)
+    assert torch.equal(found, expected)
+    ends = torch.stack((x[expected], x[expected + 1], alpha[expected], alpha[expected + 1]), -1)
+    index = torch.tensor([0, 1, 4, 5]) + beyond[:, None]
+    assert torch.equal(row.gather(1, index), ends)

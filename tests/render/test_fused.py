@@ -11,6 +11,7 @@ from torch import Tensor
 
 from filterlab import signals
 from filterlab.methods import METHODS, reconstruct
+from filterlab.ops import march
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, fused, render
 from filterlab.render.plain import PlainMarcher
 from filterlab.volume import Boundary, Volume
@@ -95,12 +96,32 @@ def test_peaks_regions_and_steps(shading: Shading | None, dtype: torch.dtype) ->
         assert images[0][..., 3].max() > 0.9
 
 
-@pytest.mark.parametrize("points", [1, 2, 40])
+@pytest.mark.parametrize("points", [1, 2, 40, 300])
 def test_any_number_of_control_points(points: int) -> None:
     x = torch.linspace(0.2, 0.8, points, dtype=torch.float64)
     generator = torch.Generator().manual_seed(points)
     rgb, alpha = (torch.rand(points, *more, generator=generator, dtype=torch.float64) for more in ((3,), ()))
     assert_same(both(samples(torch.float64), transfer=TransferFunction(x, rgb, alpha, 9.0), dtype=torch.float64))
+
+
+def test_buckets_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the image and its derivatives: intervals are found by buckets, or by comparing with every control point."""
+    generator = torch.Generator().manual_seed(2)
+    x = torch.rand(40, generator=generator).sort().values
+    volume = samples(torch.float32).requires_grad_()
+    field = reconstruct(volume, "triquadratic", scheme="fused")
+    camera = OrthographicCamera.framing(field.domain, (0.2, 1, 0.3))
+    results = []
+    for fewest in (1, 1000):
+        monkeypatch.setattr(march, "_FEWEST_BUCKETED", fewest)
+        tables = [
+            t.clone().requires_grad_() for t in (x, torch.rand(40, 3, generator=generator.manual_seed(4)), x * 0.2)
+        ]
+        assert (march._buckets(x, x) is None) == (fewest == 1000)
+        image = render(field, camera, TransferFunction(*tables), size=(9, 7), shading=LIT)
+        results.append([image, *torch.autograd.grad(image.square().sum(), [volume, *tables], retain_graph=True)])
+    for bucketed, searched in zip(*results, strict=True):
+        assert torch.equal(bucketed, searched)
 
 
 def test_values_at_control_points_are_exact() -> None:

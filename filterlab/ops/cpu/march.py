@@ -33,7 +33,7 @@ from llvmlite import ir
 from filterlab.ops.cpu import frame, mathematics
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import DOUBLE, I8, I32, I64, STORAGE, Lanes, Value, Variable
-from filterlab.ops.cpu.optics import Lights, Located, TransferTable, optical_depth, shade
+from filterlab.ops.cpu.optics import Buckets, Lights, Located, TransferTable, optical_depth, shade
 from filterlab.ops.cpu.tape import Node, Tape
 from filterlab.ops.cpu.taps import Grid, Taps
 from filterlab.ops.stencil import Lowered
@@ -58,6 +58,10 @@ FIELDS: dict[str, type] = {
     "opacities": ctypes.c_void_p,  # (intervals, 4) numbers, see `optics`
     "colors": ctypes.c_void_p,  # (intervals, 8) numbers
     "intervals": ctypes.c_int64,
+    "buckets": ctypes.c_void_p,  # (B, 8) numbers, see `optics`
+    "bucket_low": ctypes.c_double,
+    "bucket_scale": ctypes.c_double,
+    "bucket_last": ctypes.c_double,  # B − 1
     "world": ctypes.c_void_p,  # (3, 3) numbers: gradient in the world = gradient in the grid · matrix
     "shading": ctypes.c_void_p,  # (2 + 6 K) numbers: ambient, shininess, and D and S of every light
     "view": ctypes.c_void_p,  # (R, 6 K) numbers: l and h of every light
@@ -115,6 +119,7 @@ class Recipe:
         lit: whether there is shading.
         lights: K.
         skipping: whether empty bricks are left out.
+        bucketed: whether the transfer function has a table of buckets.
         arithmetic: "float32" or "float64".
         storage: dtype of the coefficients.
         lanes: P.
@@ -126,6 +131,7 @@ class Recipe:
     lit: bool
     lights: int
     skipping: bool
+    bucketed: bool
     arithmetic: str
     storage: str
     lanes: int
@@ -239,7 +245,8 @@ class _Program:
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         self.grid = Grid.of(j)
         self.taps = _Halves(e, self.half, Taps(self.half, self.recipe.stencil, self.storage, self.grid))
-        self.table = TransferTable(e, j.inner, j.opacities, j.colors, j.intervals)
+        buckets = Buckets(j.buckets, j.bucket_low, j.bucket_scale, j.bucket_last) if self.recipe.bucketed else None
+        self.table = TransferTable(e, j.inner, j.opacities, j.colors, j.intervals, buckets)
         self.prepare()
         with frame.every_chunk(e, j) as chunk:
             blocks = b.udiv(b.add(b.sub(j.last, j.first), b.sub(j.block, I64(1))), j.block)

@@ -10,8 +10,16 @@ A transfer function is two tables with one row per interval between control poin
     colours                   r₀ r₁ g₀ g₁ │ b₀ b₁ – –
 
 The interval is found by comparing v with all inner control points one after the other: three instructions per control
-point for a whole register, measured as 0.035 ns per sample and control point (AVX2). With l and h known (they are
-constant along a ray) a lit colour is
+point for a whole register, measured as 0.035 ns per sample and control point (AVX2). Where there are many, v is first
+put into one of many buckets of equal width that have one inner control point each, or none. A third table says what a
+bucket has: the two intervals that meet at its control point x₁, and the number j of the first,
+
+    x₀ x₁ x₂ j │ α₀ α₁ α₂ –
+
+v ≥ x₁ is in the second. Numbers are put into buckets by the same two operations, (v − low) · scale, here and where the
+table is made: rounding is monotonic, so that no v lands on the wrong side of a control point.
+
+With l and h known (they are constant along a ray) a lit colour is
 
     rgb · (ambient + Σ_k D_k |n·l_k|) + Σ_k S_k |n·h_k|^shininess
 
@@ -31,7 +39,7 @@ from filterlab.ops.cpu.lanes import DOUBLE, I32, I64, Lanes, Value
 from filterlab.ops.cpu.tape import Node, Tape
 from filterlab.ops.cpu.taps import _lanes_of_groups, _transpose_quads
 
-OPACITY_ROW, COLOR_ROW = 4, 8  # numbers of a row
+OPACITY_ROW, COLOR_ROW, BUCKET_ROW = 4, 8, 8  # numbers of a row
 
 
 @dataclass(frozen=True)
@@ -53,32 +61,68 @@ class Located:
         return lanes.builder.or_(*(lanes.differs(end.value) for end in self.ends[2:]))
 
 
+@dataclass(frozen=True)
+class Buckets:
+    """Address of the table, and as numbers (doubles) the start of the first bucket, 1/width, and the last's number."""
+
+    rows: Value
+    low: Value
+    scale: Value
+    last: Value
+
+
 class TransferTable:
     """The transfer function in memory.
 
     Args:
         inner: address of the control points between the first and the last, `intervals` − 1 of them.
         opacities, colors: addresses of the two tables.
+        buckets: the third table; None: control points are compared one after the other.
     """
 
-    def __init__(self, lanes: Lanes, inner: Value, opacities: Value, colors: Value, intervals: Value) -> None:
+    def __init__(
+        self,
+        lanes: Lanes,
+        inner: Value,
+        opacities: Value,
+        colors: Value,
+        intervals: Value,
+        buckets: Buckets | None = None,
+    ) -> None:
         self.lanes, self.inner, self.intervals = lanes, inner, intervals
-        self.opacities, self.colors = opacities, colors
+        self.opacities, self.colors, self.buckets = opacities, colors, buckets
 
     def locate(self, tape: Tape, value: Node) -> Located:
         """A NaN is looked up in the first interval, where its fraction is NaN."""
+        interval, packs = self._search(value.value) if self.buckets is None else self._in_bucket(value.value)
+        ends = [Node(pack) for pack in packs]
+        low, high, _, _ = ends
+        fraction = tape.divide(tape.subtract(value, low), tape.subtract(high, low))
+        return Located(interval, ends, tape.clamp_fraction(fraction))
+
+    def _search(self, value: Value) -> tuple[Value, list[Value]]:
+        """The interval and its ends, by comparing with every control point."""
         e, b = self.lanes, self.lanes.builder
         integers = ir.VectorType(I32, e.count)
         found = e.variable(ir.Constant(integers, None))
         with e.repeat(I64(0), b.sub(self.intervals, I64(1))) as j:
             point = b.load(e.advance(self.inner, j, e.number), typ=e.number)
-            beyond = b.fcmp_ordered(">=", value.value, e.everywhere(point))
+            beyond = b.fcmp_ordered(">=", value, e.everywhere(point))
             found.value = b.sub(found.value, b.sext(beyond, integers))
-        interval = found.value
-        ends = [Node(pack) for pack in self._rows(self.opacities, interval, OPACITY_ROW, 0)]
-        low, high, _, _ = ends
-        fraction = tape.divide(tape.subtract(value, low), tape.subtract(high, low))
-        return Located(interval, ends, tape.clamp_fraction(fraction))
+        return found.value, self._rows(self.opacities, found.value, OPACITY_ROW, 0)
+
+    def _in_bucket(self, value: Value) -> tuple[Value, list[Value]]:
+        """The same, by comparing with the one control point of the bucket."""
+        e, b, buckets = self.lanes, self.lanes.builder, self.buckets
+        assert buckets is not None
+        low, scale, last = (e.everywhere(e.scalar(n)) for n in (buckets.low, buckets.scale, buckets.last))
+        bucket = e.to_integer(e.clamp(e.multiply(e.subtract(value, low), scale), e.constant(0), last))
+        x0, x1, x2, number = self._rows(buckets.rows, bucket, BUCKET_ROW, 0)
+        alpha0, alpha1, alpha2, _ = self._rows(buckets.rows, bucket, BUCKET_ROW, 4)
+        beyond = b.fcmp_ordered(">=", value, x1)
+        first, second = (x0, x1, alpha0, alpha1), (x1, x2, alpha1, alpha2)
+        ends = [e.where(beyond, right, left) for left, right in zip(first, second, strict=True)]
+        return b.sub(e.to_integer(number), b.sext(beyond, ir.VectorType(I32, e.count))), ends
 
     def opacity(self, tape: Tape, located: Located) -> Node:
         return tape.blend(located.ends[2], located.ends[3], located.fraction)

@@ -217,8 +217,6 @@ class Taps:
 
     def spread(self, taps: list[Value], here: Value, weights: Weights, cotangents: list[Value]) -> None:
         """The three sums backwards: add every lane's cotangents (packs, one per row) into the coefficients."""
-        e = self.lanes
-        wx, wy, _ = weights
         for planes in self._alike():
             with self._every(planes, here) as (plane_offset, wz):
                 sums = self._spread_planes(wz, cotangents)
@@ -296,8 +294,8 @@ class Taps:
         pieces = []
         for y, taps in needed.items():
             offset = e.opaque(b.add(plane_offset, b.mul(self.grid.width, I64(y))))
-            for first in range(taps.start, taps.stop, 4):
-                pieces.append(_Piece(y, range(first, min(first + 4, taps.stop)), offset))
+            starts = range(taps.start, taps.stop, 4)
+            pieces += [_Piece(y, range(first, min(first + 4, taps.stop)), offset) for first in starts]
         return [pieces[i : i + self.at_once] for i in range(0, len(pieces), self.at_once)]
 
     def _address(self, tap: Value, piece: _Piece) -> Value:
