@@ -348,7 +348,7 @@ def test_every_item_runs_and_its_contestants_agree(item):
     outcome = item.run(TINY, lambda _: None)
     assert outcome.name == item.name
     assert not outcome.errors, outcome.errors
-    assert outcome.timings
+    assert outcome.timings or "no GPU that torch can use" in outcome.absent.values()
     assert outcome.figures or outcome.absent
     assert all(t.difference is None or t.difference <= t.tolerance for t in outcome.timings)
 

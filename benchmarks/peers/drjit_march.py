@@ -60,11 +60,11 @@ def _marcher(scene: Scene) -> Any:
         """Colour (Array3f) and optical depth of a homogeneous segment."""
         (value,), (gradient,) = volume.eval_cubic_grad(dr.fma(ray, t / n, start))
         red, green, blue, opacity = table.eval((value * (rows - 1) + 0.5) / rows)
-        color = Array3f(red, green, blue)
+        color: Any = Array3f(red, green, blue)
         if scene.lit:
             squared = dr.squared_norm(gradient)
-            facing = dr.select(squared > 0, dr.abs(dr.dot(gradient, ray)) * dr.rsqrt(squared), 0)
-            shine = dr.power(facing, int(LIGHTING.shininess))
+            facing: Any = dr.select(squared > 0, dr.abs(dr.dot(gradient, ray)) * dr.rsqrt(squared), 0)
+            shine: Any = dr.power(facing, int(LIGHTING.shininess))
             color = color * (LIGHTING.ambient + LIGHTING.diffuse * facing) + LIGHTING.specular * shine
         return color, -dr.log(1 - opacity) * thickness
 

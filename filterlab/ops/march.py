@@ -1,8 +1,9 @@
 """The fused march: rays through coefficients, a transfer function and lights, to light and optical depth.
 
 Everything is prepared by the caller as plain tensors: rays cut to the volume, in coordinates of the coefficients; the
-tables of the transfer function; lights and halfway vectors of every ray. `ops.cpu.march` is the program. No derivatives
-are recorded here: `March.adjoint` computes them from what `March.run` gave.
+tables of the transfer function; lights and halfway vectors of every ray. `ops.cpu.march` is the program, on a GPU
+`ops.cuda.march`. No derivatives are recorded here: `March.adjoint` computes them from what `March.run` gave, on the CPU
+only.
 
 Memory beyond the result: 16 bytes per interval of the transfer function; for the adjoint 8 · (9 + 12 K) bytes per ray,
 K lights, and for derivatives by the coefficients one volume of them per thread (within `SPLAT_MEMORY`).
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from filterlab.ops import cpu
+from filterlab.ops import cpu, cuda
 from filterlab.ops.fused import STORAGE
 from filterlab.ops.stencil import Stencil
 
@@ -133,7 +134,13 @@ def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dty
     if lights > MAX_LIGHTS:
         return f"up to {MAX_LIGHTS} lights; got {lights}"
     points = torch.empty(1, 0, 3, dtype=dtype, device=coefficients.device)
-    return cpu.missing(coefficients.detach()[None, None], points, stencil, None, start)
+    implementation = cuda if on_gpu(coefficients) else cpu
+    return implementation.missing(coefficients.detach()[None, None], points, stencil, None, start)
+
+
+def on_gpu(tensor: Tensor) -> bool:
+    """Whether rays through these coefficients are marched by the Triton program; it has no adjoint."""
+    return tensor.device.type == "cuda"
 
 
 @dataclass(frozen=True)
@@ -168,6 +175,10 @@ class March:
     @torch.no_grad()
     def run(self, report: Callable[[int], None] = lambda rays: None) -> tuple[Tensor, Tensor]:
         """Light (R, 3) and optical depth (R,), float64. `report` is given the number of rays done, now and then."""
+        if on_gpu(self.coefficients):
+            from filterlab.ops.cuda import march
+
+            return march.run(self, report)
         rays = self.rays.count.shape[0]
         light = torch.zeros(rays, 3, dtype=torch.float64)
         depth = torch.zeros(rays, dtype=torch.float64)

@@ -111,14 +111,14 @@ def transparent(low: Tensor, high: Tensor, transfer: TransferFunction) -> Tensor
     """Whether all values from `low` to `high` lie where the transfer function is flat at opacity 0."""
     x, alpha = transfer.positions.detach().double(), transfer.opacities.detach() == 0
     clear = torch.cat((alpha[:1], alpha[:-1] & alpha[1:], alpha[-1:]))  # below, between and above the control points
-    colored = torch.cat((torch.zeros(1), (~clear).double().cumsum(0)))
+    colored = torch.cat((low.new_zeros(1), (~clear).double().cumsum(0)))
     first, last = torch.searchsorted(x, low), torch.searchsorted(x, high, right=True)
     return (colored[last + 1] == colored[first]) & low.isfinite() & high.isfinite()
 
 
 def distances(empty: Tensor) -> Tensor:
     """Chebyshev distance of every brick to the nearest one that is not empty, uint8; at most `_FARTHEST`."""
-    reached, distance = ~empty, torch.zeros(empty.shape, dtype=torch.uint8)
+    reached, distance = ~empty, torch.zeros_like(empty, dtype=torch.uint8)
     for _ in range(_FARTHEST):
         if reached.all():
             break

@@ -28,15 +28,18 @@ SKIPPING = True
 
 
 def can_be_fused(medium: Medium) -> bool:
-    """Whether the fused marcher can run as asked: a field of scheme "fused" on the CPU, no transforms of torch.func."""
+    """Whether the fused marcher can run as asked: a field of scheme "fused", no transforms of torch.func.
+
+    On a GPU it computes images only; derivatives are the plain marcher's, on the fused sums.
+    """
     field = medium.field
     if not isinstance(field, GridField) or not isinstance(field.scheme, Direct) or field.scheme.name != "fused":
         return False
     if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
         return False
-    if medium.transfer.positions.device.type != "cpu":
-        return False
     values, start = field.coefficients.values, field.coefficients.start
+    if medium.transfer.positions.device != values.device or (medium.differentiable and march.on_gpu(values)):
+        return False
     lights = len(medium.shading.lights) if medium.shading else 0
     return march.missing(values[(0,) * (values.ndim - 3)], _stencil(medium), start, medium.dtype, lights) is None
 
@@ -234,21 +237,25 @@ def _in_the_grid(field: GridField, chords: Chords) -> march.Rays:
 def _lighting(field: GridField, shading: Shading, direction: Tensor, dtype: torch.dtype) -> march.Lighting:
     """Lights as seen along rays of unit directions `(R, 3)`."""
     view = -direction.to(dtype)
-    ambient, diffuse, specular, shininess = (
-        torch.as_tensor(x, dtype=dtype) for x in (shading.ambient, shading.diffuse, shading.specular, shading.shininess)
+
+    def number(x) -> Tensor:
+        return torch.as_tensor(x, dtype=dtype, device=view.device)
+
+    ambient, diffuse, specular, shininess = map(
+        number, (shading.ambient, shading.diffuse, shading.specular, shading.shininess)
     )
     tints, toward, halfway = view.new_zeros(0, 3), [], []
     if shading.lights:
-        tints = torch.stack([torch.as_tensor(light.color, dtype=dtype) for light in shading.lights])
+        tints = torch.stack([number(light.color) for light in shading.lights])
     for light in shading.lights:
         if light.direction is None:
             toward.append(view)
             halfway.append(view)
         else:
-            to_light = safe_normalize(torch.as_tensor(light.direction, dtype=dtype))
+            to_light = safe_normalize(number(light.direction))
             toward.append(to_light.expand_as(view))
             halfway.append(safe_normalize(to_light + view))
-    world = field.domain.geometry.gradient_to_world(torch.eye(3, dtype=torch.float64)).to(dtype)
+    world = field.domain.geometry.gradient_to_world(torch.eye(3, dtype=torch.float64)).to(view)
     return march.Lighting(
         ambient,
         shininess,

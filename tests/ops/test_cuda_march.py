@@ -226,9 +226,32 @@ def test_what_a_scene_does_not_ask_for_is_not_computed() -> None:
 def test_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     grid, stencil = torch.zeros(4, 4, 4), Stencil.jet(LINEAR, 1)
     monkeypatch.setenv("TRITON_INTERPRET", "1")
-    assert cuda.missing(grid, stencil, 0, torch.float32, 1) is None
-    assert "up to 8 lights; got 9" in str(cuda.missing(grid, stencil, 0, torch.float32, 9))
-    assert "supports go up to 6; got 7" in str(cuda.missing(grid, Stencil.jet(bspline(6), 0), 0, torch.float32, 0))
-    assert "got torch.float16" in str(cuda.missing(grid, stencil, 0, torch.float16, 0))
+    monkeypatch.setattr(march, "on_gpu", lambda tensor: True)
+    assert march.missing(grid, stencil, 0, torch.float32, 1) is None
+    assert "up to 8 lights; got 9" in str(march.missing(grid, stencil, 0, torch.float32, 9))
+    assert "supports go up to 6; got 7" in str(march.missing(grid, Stencil.jet(bspline(6), 0), 0, torch.float32, 0))
+    assert "got torch.float16" in str(march.missing(grid, stencil, 0, torch.float16, 0))
     monkeypatch.setenv("TRITON_INTERPRET", "0")
-    assert "tensors of a GPU" in str(cuda.missing(grid, stencil, 0, torch.float32, 0))
+    assert "tensors of a GPU" in str(march.missing(grid, stencil, 0, torch.float32, 0))
+
+
+@pytest.mark.parametrize("shading", [None, LIT])
+def test_render_marches_there(shading: Shading | None, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`render` itself, with a volume on the device; derivatives are the plain marcher's."""
+    if device == "cpu":  # the interpreter's tensors are
+        monkeypatch.setattr(march, "on_gpu", lambda tensor: True)
+    ran = []
+    monkeypatch.setattr(cuda, "run", lambda *a, run=cuda.run: (ran.append(1), run(*a))[1])
+    samples = _blob().to(device).requires_grad_()
+    fields = [reconstruct(samples, "triquadratic", scheme=scheme) for scheme in ("fused", "direct")]
+    transfer = TransferFunction([0.0, 0.1, 1.2], SOFT.colors, [0.0, 0.0, 0.9])
+    scene = {**SCENE, "size": (4, 3), "shading": shading, "dtype": torch.float64, "device": device}
+    camera = OrthographicCamera.framing(fields[0].domain, (0.5, 0.6, -0.6))
+    with torch.no_grad():
+        fused, plain = (render(field, camera, transfer, **scene) for field in fields)
+    assert ran
+    assert_same((fused, plain))
+    assert fused[..., 3].max() > 0.5
+    ran.clear()
+    assert render(fields[0], camera, transfer, **scene).requires_grad
+    assert not ran

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from filterlab.ops.cuda.source import Source
 from filterlab.ops.cuda.taps import Taps
-from filterlab.ops.stencil import Lowered, Stencil
+from filterlab.ops.stencil import Lowered
 
 if TYPE_CHECKING:
     from filterlab.ops.march import March
@@ -233,17 +233,6 @@ class _Program:
                 line(f"shine_{k} += tl.load(shading + {5 + 6 * light + k}) * highlight")
         for k in range(3):
             line(f"color_{k} = color_{k} * matt_{k} + shine_{k}")
-
-
-def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dtype, lights: int) -> str | None:
-    """What keeps the march from running here as asked; None: nothing does. Arguments as for `ops.march.missing`."""
-    from filterlab.ops import cuda
-    from filterlab.ops.march import MAX_LIGHTS
-
-    if lights > MAX_LIGHTS:
-        return f"up to {MAX_LIGHTS} lights; got {lights}"
-    points = torch.empty(1, 0, 3, dtype=dtype, device=coefficients.device)
-    return cuda.missing(coefficients.detach()[None, None], points, stencil, None, start)
 
 
 @torch.no_grad()
