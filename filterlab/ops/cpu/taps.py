@@ -52,6 +52,8 @@ _LINES_AT_ONCE = 4
 
 Measured with AVX-512 (Zen 5), coefficients in the cache: 0.8 times the time of one line after the other.
 """
+_ROWS_WITH_LINES = 4
+"""Sums of more rows need the registers themselves: the gradient to points of a tricubic jet took 1.25 × the time."""
 
 Weights = list[list[list[Value | None]]]
 """[axis][function][t]: the weight of tap t, a pack; None where the function has none."""
@@ -103,7 +105,9 @@ class Taps:
         self.lanes, self.builder = lanes, lanes.builder
         self.stencil, self.storage, self.grid = stencil, storage, grid
         self.supports = stencil.supports
-        self.at_once = _LINES_AT_ONCE if lanes.count * lanes.bits >= 512 else 1
+        wide = lanes.count * lanes.bits >= 512
+        self.written_at_once = _LINES_AT_ONCE if wide else 1
+        self.read_at_once = _LINES_AT_ONCE if wide and len(stencil.rows) <= _ROWS_WITH_LINES else 1
         self._plane_weights = lanes.reserve(lanes.pack, self.supports[2] * len(stencil.functions[2]))
 
     # --- where the points read, and with which weights ---
@@ -288,7 +292,7 @@ class Taps:
 
     # --- lines of taps in memory ---
 
-    def _pieces(self, plane_offset: Value, needed: dict[int, range]) -> list[list[_Piece]]:
+    def _pieces(self, plane_offset: Value, needed: dict[int, range], at_once: int) -> list[list[_Piece]]:
         """Lines of taps in pieces of at most four, as many at a time as there are registers for."""
         e, b = self.lanes, self.builder
         pieces = []
@@ -296,7 +300,7 @@ class Taps:
             offset = e.opaque(b.add(plane_offset, b.mul(self.grid.width, I64(y))))
             starts = range(taps.start, taps.stop, 4)
             pieces += [_Piece(y, range(first, min(first + 4, taps.stop)), offset) for first in starts]
-        return [pieces[i : i + self.at_once] for i in range(0, len(pieces), self.at_once)]
+        return [pieces[i : i + at_once] for i in range(0, len(pieces), at_once)]
 
     def _address(self, tap: Value, piece: _Piece) -> Value:
         """Of the first number of a piece, from a lane's first tap."""
@@ -312,7 +316,7 @@ class Taps:
         """
         e = self.lanes
         found: dict[int, dict[int, Value]] = {y: {} for y in needed}
-        for pieces in self._pieces(plane_offset, needed):
+        for pieces in self._pieces(plane_offset, needed, self.read_at_once):
             read = [[self._read(tap, piece) for piece in pieces] for tap in self._in_groups(taps)]
             for i, piece in enumerate(pieces):
                 packs = self._transposed(self._in_lanes([row[i] for row in read]), len(piece.taps))
@@ -359,7 +363,7 @@ class Taps:
         coefficient. Measured (Zen 5): 0.7 times the time.
         """
         e, b = self.lanes, self.builder
-        for pieces in self._pieces(plane_offset, needed):
+        for pieces in self._pieces(plane_offset, needed, self.written_at_once):
             rows = []
             for piece in pieces:
                 first = needed[piece.y].start
