@@ -5,8 +5,9 @@ tables of the transfer function; lights and halfway vectors of every ray. `ops.c
 `ops.cuda.march`. No derivatives are recorded here: `March.adjoint` computes them from what `March.run` gave, on the CPU
 only.
 
-Memory beyond the result: 16 bytes per interval of the transfer function; for the adjoint 8 · (9 + 12 K) bytes per ray,
-K lights, and for derivatives by the coefficients one volume of them per thread (within `SPLAT_MEMORY`).
+Memory beyond the result: 48 bytes per interval of the transfer function and 32 per bucket (at most 4096) in float32;
+for the adjoint 8 · (9 + 12 K) bytes per ray, K lights, and for derivatives by the coefficients one volume of them per
+thread (within `SPLAT_MEMORY`).
 """
 
 from __future__ import annotations
@@ -172,6 +173,16 @@ class March:
     def dtype(self) -> torch.dtype:
         return self.transfer.positions.dtype
 
+    @property
+    def opaque(self) -> float:
+        """Optical depth beyond which a ray ends."""
+        return min(_DARK[self.dtype], -math.log(self.faint) if self.faint > 0 else math.inf)
+
+    @property
+    def slack(self) -> float:
+        """By how much a point may be rounded, in voxels."""
+        return _SLACK[self.dtype] * (abs(self.start) + max(self.coefficients.shape))
+
     @torch.no_grad()
     def run(self, report: Callable[[int], None] = lambda rays: None) -> tuple[Tensor, Tensor]:
         """Light (R, 3) and optical depth (R,), float64. `report` is given the number of rays done, now and then."""
@@ -265,7 +276,7 @@ class March:
             block=_RAYS_PER_BLOCK,
             per_unit=1 / self.transfer.unit,
             faint=self.faint,
-            opaque=min(_DARK[self.dtype], -math.log(self.faint) if self.faint > 0 else math.inf),
+            opaque=self.opaque,
         )
         for axis, size, support in zip(march.AXES, (w, h, d), self.stencil.supports, strict=True):
             setattr(job, f"low_{axis}", self.start)
@@ -284,7 +295,7 @@ class March:
         if self.bricks is not None:
             inputs["bricks"] = self.bricks.distance
             job.edge = self.bricks.edge
-            job.slack = _SLACK[self.dtype] * (abs(self.start) + max(d, h, w))
+            job.slack = self.slack
             for axis, count in zip(march.AXES, self.bricks.distance.shape[::-1], strict=True):
                 setattr(job, f"bricks_{axis}", count)
         for name, tensor in inputs.items():

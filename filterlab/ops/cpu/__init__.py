@@ -242,10 +242,9 @@ def _zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
 
     Threads may work on two entries of one volume at a time, so that the room of one may not be part of the next.
     """
-    entry = np.empty(shape[1:], _ARITHMETIC[dtype])
-    memory = np.zeros(shape[0] * (entry.size + 1), entry.dtype)
-    strides = ((entry.size + 1) * entry.itemsize, *entry.strides)
-    return torch.from_numpy(np.ndarray(tuple(shape), entry.dtype, memory, 0, strides))
+    size = math.prod(shape[1:])
+    memory = np.zeros((shape[0], size + 1), _ARITHMETIC[dtype])
+    return torch.from_numpy(memory[:, :size].reshape(tuple(shape)))  # a view: only the last axis is split
 
 
 def _run(

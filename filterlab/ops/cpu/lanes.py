@@ -235,6 +235,14 @@ class Lanes:
     def shuffle(self, a: Value, b: Value, pattern: Sequence[int]) -> Value:
         return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(pattern)), list(pattern)))
 
+    def join(self, vectors: Sequence[Value]) -> Value:
+        """Vectors laid end to end; their number is a power of two."""
+        vectors = list(vectors)
+        while len(vectors) > 1:
+            width = range(2 * vectors[0].type.count)
+            vectors = [self.shuffle(a, b, width) for a, b in zip(vectors[::2], vectors[1::2], strict=True)]
+        return vectors[0]
+
     def transpose(self, packs: Sequence[Value]) -> list[Value]:
         """P packs as the rows of a P×P table -> its columns.
 

@@ -143,7 +143,7 @@ class TransferTable:
         for lane in range(e.count):
             place = b.add(b.zext(e.lane(start, lane), I64), I64(first))
             quads.append(e.load(e.advance(table, place, e.number), e.number, 4))
-        return _transpose_quads(e, [_joined(e, _lanes_of_groups(quads, (k,))) for k in range(4)])
+        return _transpose_quads(e, [e.join(_lanes_of_groups(quads, (k,))) for k in range(4)])
 
     def add_to_rows(self, table: Value, interval: Value, packs: Sequence[Value], width: int, first: int) -> None:
         """Add up to four packs to every lane's row of a table of doubles, one lane after the other."""
@@ -158,14 +158,6 @@ class TransferTable:
             row = b.mul(b.zext(e.lane(interval, lane), I64), I64(width))
             place = e.advance(table, b.add(row, I64(first)), DOUBLE)
             e.store(b.fadd(e.load(place, DOUBLE, 4), quad), place)
-
-
-def _joined(e: Lanes, vectors: list[Value]) -> Value:
-    """Vectors laid end to end; their number is a power of two."""
-    while len(vectors) > 1:
-        width = range(2 * vectors[0].type.count)
-        vectors = [e.shuffle(a, b, width) for a, b in zip(vectors[::2], vectors[1::2], strict=True)]
-    return vectors[0]
 
 
 def optical_depth(tape: Tape, opacity: Node, length: Node) -> Node:

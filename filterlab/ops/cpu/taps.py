@@ -317,20 +317,15 @@ class Taps:
         e = self.lanes
         found: dict[int, dict[int, Value]] = {y: {} for y in needed}
         for pieces in self._pieces(plane_offset, needed, self.read_at_once):
-            read = [[self._read(tap, piece) for piece in pieces] for tap in self._in_groups(taps)]
+            read = {lane: [self._read(taps[lane], piece) for piece in pieces] for lane in self._as_joined()}
             for i, piece in enumerate(pieces):
-                packs = self._transposed(self._in_lanes([row[i] for row in read]), len(piece.taps))
+                packs = self._transposed([read[lane][i] for lane in range(e.count)], len(piece.taps))
                 found[piece.y] |= zip(piece.taps, (e.convert(p, self.storage) for p in packs), strict=True)
             yield from ((y, found.pop(y)) for y in list(found) if len(found[y]) == len(needed[y]))
 
-    def _in_groups(self, lanes: list[Value]) -> list[Value]:
+    def _as_joined(self) -> list[int]:
         """The first lane of every group, then the second of every group, …: those that are joined into one register."""
-        return [lanes[i] for k in range(4) for i in range(k, len(lanes), 4)]
-
-    def _in_lanes(self, grouped: list[Value]) -> list[Value]:
-        """The inverse of `_in_groups`."""
-        groups = len(grouped) // 4
-        return [grouped[i % 4 * groups + i // 4] for i in range(len(grouped))]
+        return [lane for k in range(4) for lane in range(k, self.lanes.count, 4)]
 
     def _read(self, tap: Value, piece: _Piece) -> Value:
         e, raw, count = self.lanes, self.storage.raw, len(piece.taps)
@@ -341,17 +336,10 @@ class Taps:
         """Every lane's row of taps -> the first tap of every lane, the second of every lane, …"""
         e = self.lanes
         if taps == 1:
-            return [self._join(rows)]
+            return [e.join(rows)]
         if taps == 2:
-            return _transpose_pairs(e, [self._join(_lanes_of_groups(rows, k)) for k in ((0, 1), (2, 3))])
-        return _transpose_quads(e, [self._join(_lanes_of_groups(rows, (k,))) for k in range(4)])[:taps]
-
-    def _join(self, vectors: list[Value]) -> Value:
-        """Vectors laid end to end; their number is a power of two."""
-        while len(vectors) > 1:
-            width = range(2 * vectors[0].type.count)
-            vectors = [self.lanes.shuffle(a, b, width) for a, b in zip(vectors[::2], vectors[1::2], strict=True)]
-        return vectors[0]
+            return _transpose_pairs(e, [e.join(_lanes_of_groups(rows, k)) for k in ((0, 1), (2, 3))])
+        return _transpose_quads(e, [e.join(_lanes_of_groups(rows, (k,))) for k in range(4)])[:taps]
 
     def _add_lines(
         self, taps: list[Value], plane_offset: Value, needed: dict[int, range], values: dict[int, list[Value]]

@@ -258,11 +258,9 @@ def run(march: March, report: Callable[[int], None] = lambda rays: None) -> tupl
 
 
 def _arrays(march: March) -> dict[str, Tensor]:
-    from filterlab.ops.march import _DARK, _SLACK, _tables
+    from filterlab.ops.march import _tables
 
-    size = abs(march.start) + max(march.coefficients.shape)
-    opaque = min(_DARK[march.dtype], -math.log(march.faint) if march.faint > 0 else math.inf)
-    numbers = (march.step, 1 / march.transfer.unit, opaque, _SLACK[march.dtype] * size, math.inf)
+    numbers = (march.step, 1 / march.transfer.unit, march.opaque, march.slack, math.inf)
     return {
         "coefficients": march.coefficients,
         **{name: getattr(march.rays, name) for name in ("entry", "direction", "length", "offset", "count")},
