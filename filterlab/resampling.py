@@ -96,7 +96,7 @@ def _separable(
 ) -> Tensor:
     """Σ over the field's separable terms of one pass per axis; old voxel = scale · new voxel + start."""
     stored = field.coefficients
-    values = stored.values.to(dtype)
+    values = stored.decoded(dtype)
     positions = []
     for axis, n in enumerate(shape[::-1]):
         # float64 positions: the weights are exact however large the grid, and they are few

@@ -185,6 +185,7 @@ class Reconstruction(StrictModel):
     boundary: Annotated[str, AfterValidator(_known_boundary)] = "mirror"
     gradient: str | None = None
     sampler: Literal["exact", "texture_unit"] = "exact"
+    storage: Literal["float64", "float32", "float16", "bfloat16", "int16", "int8", "uint8"] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -206,6 +207,7 @@ class Reconstruction(StrictModel):
             scheme=self.scheme,
             gradient=self.gradient,
             sampler=self.sampler,
+            storage=self.storage,
         )
 
 
