@@ -11,7 +11,7 @@ from importlib import import_module
 
 from experiments.extremes.contract import Case
 
-_MODULES = ("coordinates",)
+_MODULES = ("coordinates", "values", "shapes")
 
 
 def _collected() -> dict[str, Case]:
