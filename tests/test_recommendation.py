@@ -85,7 +85,7 @@ def test_gradients_count_for_surfaces_and_pictures(samples) -> None:
 
 def test_the_step_is_the_longest_that_loses_half_of_the_budget(samples) -> None:
     generous = recommend(samples, 5.0, task="dvr", methods=["trilinear"], **FAST)
-    tight = recommend(samples, 0.01, task="dvr", methods=["trilinear"], **FAST)
+    tight = recommend(samples, 0.001, task="dvr", methods=["trilinear"], **FAST)
     assert generous.chosen.step == 1.0
     assert tight.chosen.step is not None
     assert tight.chosen.step < 1.0
