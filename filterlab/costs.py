@@ -25,7 +25,9 @@ Clock = Callable[[], float]
 Tick = Callable[[float], None]
 """Told which fraction (0 … 1) is done."""
 
-SHORTEST = 0.004  # seconds of a turn; what is faster is called several times in it
+SHORTEST = (
+    0.004  # seconds of a turn; what is faster is called several times in it, after half as many that do not count
+)
 ROUNDS = 31  # at most, where the time allows
 LEAST_ROUNDS = 3
 
@@ -189,7 +191,7 @@ def take_turns(
     clock = clock or time.perf_counter
     warm = {name: _seconds(call, 1, time.perf_counter) for name, call in calls.items()}
     times = {name: max(1, math.ceil(SHORTEST / max(t, 1e-7))) for name, t in warm.items()}
-    one_round = sum(times[name] * t for name, t in warm.items())
+    one_round = sum((times[name] + times[name] // 2) * t for name, t in warm.items())
     affordable = int(seconds / max(one_round, 1e-9))
     number = max(min(rounds, affordable), min(rounds, least)) if calls else 0
     taken: dict[str, list[float]] = {name: [] for name in calls}
@@ -197,6 +199,7 @@ def take_turns(
         wall, cpu = time.perf_counter(), time.process_time()
         for r in range(number):
             for i, (name, call) in enumerate(calls.items()):
+                _seconds(call, times[name] // 2, clock)  # who went before left its own data in the caches
                 taken[name].append(_seconds(call, times[name], clock))
                 tick((r + (i + 1) / len(calls)) / number)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
@@ -207,7 +210,7 @@ def _seconds(call: Callable[[], Any], times: int, clock: Clock) -> float:
     start = clock()
     for _ in range(times):
         call()
-    return (clock() - start) / times
+    return (clock() - start) / max(times, 1)
 
 
 @contextmanager

@@ -50,6 +50,14 @@ def test_what_is_fast_is_called_until_a_turn_is_long_enough(monkeypatch):
     assert rounds.seconds["A"] == pytest.approx([costs.SHORTEST / 4] * 2)
 
 
+def test_a_turn_of_many_calls_begins_with_some_that_do_not_count(monkeypatch):
+    """Who went before left its own data in the caches: the first calls of a turn are slow."""
+    clock, usual = Clock(monkeypatch), costs.SHORTEST / 4
+    rounds = take_turns({"A": clock.call("A", usual, 9.0, 9.0, usual)}, seconds=1, rounds=1)
+    assert len(clock.calls) == 1 + 2 + 4
+    assert rounds.seconds["A"] == pytest.approx([usual])
+
+
 @pytest.mark.parametrize(("seconds", "number"), [(100, 9), (16, 5), (1, 3)])
 def test_rounds_are_as_many_as_the_time_allows_but_never_too_few(monkeypatch, seconds, number):
     clock = Clock(monkeypatch)
