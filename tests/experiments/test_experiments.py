@@ -97,6 +97,19 @@ def tiny(name, scan):
             },
         },
     }
+    configs["equal_error"] = {
+        "studies": [{"signal": {"name": "gaussian", "parameters": {"sigma": 0.5}}}],
+        "comparisons": [
+            {"quantity": "value", "usual": "trilinear"},
+            {"quantity": "gradient", "usual": {"method": "trilinear", "gradient": "central"}},
+        ],
+        "resolutions": [8, 12],
+        "methods": ["triquadratic", {"method": "triquadratic", "prefilter": False}],
+        "largest": 12,
+        "points": 200,
+        "timed_points": 50,
+        "seconds": 0,
+    }
     parts = {n: {"experiment": n, "description": f"tiny {n}", **c} for n, c in configs.items()}
     parts["demo"] = {"experiment": "demo", "description": "tiny", "sections": [parts["rms_error"], parts["dvr_volume"]]}
     return parts[name]
