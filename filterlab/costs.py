@@ -98,7 +98,7 @@ class Cost:
 
 def measure(
     candidates: Mapping[str, Callable[[], Field]],
-    points: Tensor,
+    points: Tensor | Mapping[str, Tensor],
     *,
     order: int = 1,
     seconds: float = 2.0,
@@ -108,8 +108,9 @@ def measure(
 
     Args:
         candidates: name -> builds the field, from samples that exist before: all that it does counts as building.
-        points: world points `(P, 3)` (for batched fields `(N, P, 3)`) at which every candidate is evaluated. Their
-            order in space counts: points along rays read memory that is near, random ones do not.
+        points: world points `(P, 3)` (for batched fields `(N, P, 3)`) at which every candidate is evaluated; or those
+            of each candidate by its name, to compare precisions (float64 points are computed in float64) or devices.
+            Their order in space counts: points along rays read memory that is near, random ones do not.
         order: of the jets that are timed: 0 values, 1 values and gradients, 2 Hessians too.
         seconds: about how long it may take, half of it for building and half for sampling. Where that does not suffice
             for three rounds it takes longer; first calls, which compile and load, are not counted and come
@@ -124,19 +125,20 @@ def measure(
     Raises:
         ValueError: no points, or points that the fields refuse.
     """
-    if points.numel() == 0:
-        raise ValueError(f"expected points (P, 3) with P ≥ 1 to sample at; got shape {tuple(points.shape)}")
+    where = {name: points if isinstance(points, Tensor) else points[name] for name in candidates}
+    for name, p in where.items():
+        if p.numel() == 0:
+            raise ValueError(f"expected points (P, 3) with P ≥ 1 to sample {name} at; got shape {tuple(p.shape)}")
     with torch.no_grad():
-        builds = {name: _finished(build, points.device) for name, build in candidates.items()}
+        builds = {name: _finished(build, where[name].device) for name, build in candidates.items()}
         fields = {name: build() for name, build in builds.items()}
-        jets = {name: _finished(_jet(field, points, order), points.device) for name, field in fields.items()}
+        jets = {name: _finished(_jet(f, where[name], order), where[name].device) for name, f in fields.items()}
         for jet in jets.values():
             jet()
         building = take_turns(builds, seconds=seconds / 2, tick=lambda done: tick(done / 2))
         sampling = take_turns(jets, seconds=seconds / 2, tick=lambda done: tick((1 + done) / 2))
-    samples = points.numel() // 3
     return {
-        name: _cost(field, building.seconds[name], [1e9 * s / samples for s in sampling.seconds[name]])
+        name: _cost(field, building.seconds[name], [3e9 * s / where[name].numel() for s in sampling.seconds[name]])
         for name, field in fields.items()
     }
 

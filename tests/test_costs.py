@@ -152,5 +152,15 @@ def test_no_points_are_refused_before_anything_is_built():
     def build():
         raise AssertionError("built")
 
-    with pytest.raises(ValueError, match=r"P ≥ 1 to sample at; got shape \(0, 3\)"):
+    with pytest.raises(ValueError, match=r"P ≥ 1 to sample A at; got shape \(0, 3\)"):
         measure({"A": build}, torch.empty(0, 3))
+
+
+def test_every_candidate_may_have_points_of_its_own(monkeypatch):
+    clock = Clock(monkeypatch)
+    fields = {"A": Counting(clock), "B": Counting(clock)}
+    points = {"A": torch.rand(10, 3), "B": torch.rand(1000, 3, dtype=torch.float64)}
+    found = measure({name: lambda name=name: fields[name] for name in fields}, points, seconds=0.1)
+    assert [found[name].sample.median for name in fields] == pytest.approx([1000, 1000])
+    with pytest.raises(ValueError, match="to sample B at"):
+        measure({"A": lambda: fields["A"], "B": lambda: fields["B"]}, {**points, "B": points["B"][:0]})
