@@ -26,7 +26,6 @@ import filterlab as fl
 from experiments.config import (
     BoundaryName,
     Dtype,
-    ExperimentConfig,
     Recipe,
     Recipes,
     SignalChoice,
@@ -35,7 +34,7 @@ from experiments.config import (
 )
 from experiments.rms_error import Truth, evaluate
 from experiments.runs import Record, Run, Unit
-from experiments.timing import along_rays, cost_record, ratio
+from experiments.timing import CLOCKS, TimedConfig, along_rays, cost_record, ratio
 from filterlab.costs import measure
 from filterlab.io.config import StrictModel
 
@@ -59,7 +58,7 @@ class Comparison(StrictModel):
     usual: Recipe
 
 
-class Config(ExperimentConfig):
+class Config(TimedConfig):
     """Resolution, memory and time at equal error.
 
     Attributes:
@@ -261,6 +260,7 @@ def _times(config: Config, index: str, comparison: Comparison, n: int, run: Run)
             points,
             order=ORDERS[quantity],
             seconds=config.seconds,
+            clock=CLOCKS[config.clock],
             tick=lambda done, half=half: run.advance((half + done) / 2),
         )
         found[order] = _with_ratios({key: cost_record(cost) for key, cost in costs.items()})

@@ -24,6 +24,7 @@ _NAMES = (
     "dvr_volume",
     "texture_precision",
     "inverse_dvr",
+    "speed_accuracy",
     "equal_error",
     "demo",
 )

@@ -6,16 +6,40 @@ Points along rays are what a renderer asks for, one after the other near in memo
 from __future__ import annotations
 
 import math
+import time
+from typing import Literal
 
 import torch
+from pydantic import model_validator
 from torch import Tensor
 
 import filterlab as fl
+from experiments.config import ExperimentConfig
 from experiments.runs import Record
-from filterlab.costs import Cost, Quartiles, per_round
+from filterlab.costs import Clock, Cost, Quartiles, per_round
+
+CLOCKS: dict[str, Clock] = {"wall": time.perf_counter, "cpu": time.process_time}
 
 SLANT = (0.12, 0.08)  # of the rays across x and y, in units of their way along z
 INNER = 0.9  # of the box: points keep away from its ends
+
+
+class TimedConfig(ExperimentConfig):
+    """A config with a clock: `wall`, or `cpu`, which does not see the time in which the core worked for others."""
+
+    clock: Literal["wall", "cpu"] = "wall"
+
+    @model_validator(mode="after")
+    def _one_thread(self) -> TimedConfig:
+        if self.clock == "cpu" and (self.threads != 1 or self.device != "cpu"):
+            raise ValueError("clock: cpu adds up the time of all threads; expected threads: 1 and device: cpu with it")
+        return self
+
+    @property
+    def timed_by(self) -> str:
+        """In words."""
+        threads = "one thread" if self.threads == 1 else "the threads of this run"
+        return f"CPU time of {threads}" if self.clock == "cpu" else f"wall-clock time on {threads}"
 
 
 def along_rays(field: fl.Field, count: int, spacing: float, device: str = "cpu") -> Tensor:

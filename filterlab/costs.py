@@ -102,6 +102,7 @@ def measure(
     *,
     order: int = 1,
     seconds: float = 2.0,
+    clock: Clock | None = None,
     tick: Tick = lambda _: None,
 ) -> dict[str, Cost]:
     """What each candidate costs, on as many threads as torch is set to, without derivatives being recorded.
@@ -115,6 +116,8 @@ def measure(
         seconds: about how long it may take, half of it for building and half for sampling. Where that does not suffice
             for three rounds it takes longer; first calls, which compile and load, are not counted and come
             on top.
+        clock: default: `time.perf_counter`. `time.process_time` does not see the time in which the core worked for
+            others; it adds up all threads.
         tick: told which fraction is done.
 
     All fields are kept until the end: memory is the sum of their coefficients, and of one more while they are built.
@@ -135,8 +138,8 @@ def measure(
         jets = {name: _finished(_jet(f, where[name], order), where[name].device) for name, f in fields.items()}
         for jet in jets.values():
             jet()
-        building = take_turns(builds, seconds=seconds / 2, tick=lambda done: tick(done / 2))
-        sampling = take_turns(jets, seconds=seconds / 2, tick=lambda done: tick((1 + done) / 2))
+        building = take_turns(builds, seconds=seconds / 2, clock=clock, tick=lambda done: tick(done / 2))
+        sampling = take_turns(jets, seconds=seconds / 2, clock=clock, tick=lambda done: tick((1 + done) / 2))
     return {
         name: _cost(field, building.seconds[name], [3e9 * s / where[name].numel() for s in sampling.seconds[name]])
         for name, field in fields.items()

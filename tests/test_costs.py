@@ -148,6 +148,12 @@ def test_a_slow_first_call_is_not_taken_for_the_usual_one(monkeypatch):
     assert len(field.asked) > 40 * costs.ROUNDS
 
 
+def test_another_clock_can_be_asked(monkeypatch):
+    clock = Clock(monkeypatch)
+    found = measure({"A": lambda: Counting(clock)}, torch.rand(10, 3), seconds=0.1, clock=lambda: 2 * clock.now)
+    assert found["A"].sample.median == pytest.approx(2000)
+
+
 def test_no_points_are_refused_before_anything_is_built():
     def build():
         raise AssertionError("built")

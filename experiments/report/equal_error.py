@@ -210,7 +210,7 @@ def _times(config: Config, comparison: Comparison, searches: Sequence[Record], c
     caption = (
         f"Time per sample of the {WORDS[comparison.quantity]} in units of the usual one (first row: nanoseconds), for "
         f"{config.timed_points:,} points along slanted parallel rays, half a voxel of n³ apart, and the same points in "
-        "random order; medians of ratios within rounds. Build: prefilter and padding, median."
+        f"random order; {config.timed_by}, medians of ratios within rounds. Build: prefilter and padding, median."
     )
     return Table(columns, rows, caption)
 
