@@ -1,8 +1,8 @@
 """What fields cost on this machine: time to build them, time per sample, memory of their coefficients.
 
-Candidates take turns, A B C A B C …: what slows the machine down slows all of them, and medians over the rounds do not
-see a turn that something else disturbed. Letters: t_A(r), seconds of one call of candidate A in round r. The ratio
-A ÷ B is the median over r of t_A(r) / t_B(r): what both suffer in a round cancels.
+Candidates take turns, A B C A B C …: what slows the machine down slows all of them. Medians over the calls of a turn,
+and over the rounds, do not see what something else disturbed. Letters: t_A(r), seconds of one call of candidate A in
+round r. The ratio A ÷ B is the median over r of t_A(r) / t_B(r): what both suffer in a round cancels.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ Tick = Callable[[float], None]
 SHORTEST = (
     0.004  # seconds of a turn; what is faster is called several times in it, after half as many that do not count
 )
+BATCHES = 9  # of calls in a turn, at most
 ROUNDS = 31  # at most, where the time allows
 LEAST_ROUNDS = 3
 
@@ -53,7 +54,8 @@ class Rounds:
     """What `take_turns` found.
 
     Attributes:
-        seconds: name -> seconds of one call, one number per round; the mean where a turn has several calls.
+        seconds: name -> seconds of one call, one number per round; where a turn has several calls, their median (of
+            means of batches).
         calls: name -> calls in a turn.
         cores: how many cores this process kept busy on average while the rounds ran; far below the number of threads:
             the machine had other work, or the calls wait.
@@ -205,10 +207,17 @@ def take_turns(
         for r in range(number):
             for i, (name, call) in enumerate(calls.items()):
                 _seconds(call, times[name] // 2, clock)  # who went before left its own data in the caches
-                taken[name].append(_seconds(call, times[name], clock))
+                taken[name].append(_turn(call, times[name], clock))
                 tick((r + (i + 1) / len(calls)) / number)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return Rounds(taken, times, cpu / max(wall, 1e-9))
+
+
+def _turn(call: Callable[[], Any], times: int, clock: Clock) -> float:
+    """Seconds per call: the median of batches, so that a disturbance shorter than the turn does not count."""
+    number = min(times, BATCHES)
+    sizes = [times // number + (i < times % number) for i in range(number)]
+    return statistics.median([_seconds(call, size, clock) for size in sizes])
 
 
 def _seconds(call: Callable[[], Any], times: int, clock: Clock) -> float:

@@ -58,6 +58,15 @@ def test_a_turn_of_many_calls_begins_with_some_that_do_not_count(monkeypatch):
     assert rounds.seconds["A"] == pytest.approx([usual])
 
 
+def test_what_disturbs_some_calls_of_a_turn_does_not_count(monkeypatch):
+    clock, usual = Clock(monkeypatch), costs.SHORTEST / 20
+    call = clock.call("A", *[usual] * 15, 50.0, *[usual] * 9, 7.0, usual)
+    rounds = take_turns({"A": call}, seconds=1e6, rounds=1)
+    assert rounds.calls == {"A": 20}
+    assert len(clock.calls) == 1 + 10 + 20
+    assert rounds.seconds["A"] == pytest.approx([usual])
+
+
 @pytest.mark.parametrize(("seconds", "number"), [(100, 9), (16, 5), (1, 3)])
 def test_rounds_are_as_many_as_the_time_allows_but_never_too_few(monkeypatch, seconds, number):
     clock = Clock(monkeypatch)

@@ -82,13 +82,14 @@ def _overview(config: Config, records: Mapping[str, Record], index: int, n: int)
         "where it is another."
     )
     table = _table(config, records, index, [(n, k) for k in first], caption)
+    build = [column.title for column in table.columns].index("build")
     fronts = _on_front(records, index, n)
     rows = []
     for key, row in zip(first, table.rows, strict=True):
         own = {k: costs[k]["variant"] for k in fronts if _same(costs[k], costs[key])}
         said = [f"{q}{'' if k == key else f' ({v})'}" for k, v in own.items() for q in fronts[k]]
-        rows.append([*row[:-1], ", ".join(said) or MISSING])
-    return [replace(table, rows=rows)]
+        rows.append([*row[:build], ", ".join(said) or MISSING])
+    return [replace(table, columns=[*table.columns[:build], table.columns[-1]], rows=rows)]
 
 
 def _table(

@@ -206,9 +206,17 @@ def test_fronts_are_of_the_right_numbers(records):
     } | {("image_rms", "time", 8), ("image_rms", "time", 12)}
     smallest = fronts["value_rms", "memory", None][0]
     assert smallest == "8/triquadratic+uint8", "of the least memory the most accurate"
-    assert not any("central" in m for m in fronts["value_rms", "time", 12]), "its value is that of trilinear"
     errors = [records[f"error/0/{m}"]["gradient_rms"] for m in fronts["gradient_rms", "memory", None]]
     assert errors == sorted(errors, reverse=True)
+
+
+def test_another_gradient_makes_no_other_value():
+    c = config()
+    parts = {error: speed_accuracy._taking_part(c, error) for error in ("value_rms", "gradient_rms")}
+    assert parts["gradient_rms"] == c.candidates
+    assert {p.key for p in c.candidates} - {p.key for p in parts["value_rms"]} == {
+        p.key for p in c.candidates if p.recipe.gradient == "central"
+    }
 
 
 def test_images_come_nearer_to_the_signal_with_shorter_steps(records):
