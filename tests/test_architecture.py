@@ -22,6 +22,7 @@ FLOORS = {
     "prefilters": 1,
     "ops": 2,
     "fields": 3,
+    "missing_values": 3,
     "signals": 4,
     "methods": 4,
     "resampling": 5,
