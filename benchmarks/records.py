@@ -81,7 +81,8 @@ class Timing(Record):
     Attributes:
         name: of the contestant.
         first_call: seconds of its first call: compilation, loading and caches included.
-        seconds: of one call, one number per round; the mean where a round has several calls.
+        seconds: of one call, one number per round; where a round has several calls, their median (see
+            `filterlab.costs.take_turns`).
         spread: of `seconds`.
         calls: calls in a round.
         samples: what one call computes this many of.

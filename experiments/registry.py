@@ -24,6 +24,8 @@ _NAMES = (
     "dvr_volume",
     "texture_precision",
     "inverse_dvr",
+    "speed_accuracy",
+    "equal_error",
     "stability",
     "demo",
 )

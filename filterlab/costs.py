@@ -1,8 +1,8 @@
 """What fields cost on this machine: time to build them, time per sample, memory of their coefficients.
 
-Candidates take turns, A B C A B C …: what slows the machine down slows all of them, and medians over the rounds do not
-see a turn that something else disturbed. Letters: t_A(r), seconds of one call of candidate A in round r. The ratio
-A ÷ B is the median over r of t_A(r) / t_B(r): what both suffer in a round cancels.
+Candidates take turns, A B C A B C …: what slows the machine down slows all of them. Medians over the calls of a turn,
+and over the rounds, do not see what something else disturbed. Letters: t_A(r), seconds of one call of candidate A in
+round r. The ratio A ÷ B is the median over r of t_A(r) / t_B(r): what both suffer in a round cancels.
 """
 
 from __future__ import annotations
@@ -25,7 +25,10 @@ Clock = Callable[[], float]
 Tick = Callable[[float], None]
 """Told which fraction (0 … 1) is done."""
 
-SHORTEST = 0.004  # seconds of a turn; what is faster is called several times in it
+SHORTEST = (
+    0.004  # seconds of a turn; what is faster is called several times in it, after half as many that do not count
+)
+BATCHES = 9  # of calls in a turn, at most
 ROUNDS = 31  # at most, where the time allows
 LEAST_ROUNDS = 3
 
@@ -51,7 +54,8 @@ class Rounds:
     """What `take_turns` found.
 
     Attributes:
-        seconds: name -> seconds of one call, one number per round; the mean where a turn has several calls.
+        seconds: name -> seconds of one call, one number per round; where a turn has several calls, their median (of
+            means of batches).
         calls: name -> calls in a turn.
         cores: how many cores this process kept busy on average while the rounds ran; far below the number of threads:
             the machine had other work, or the calls wait.
@@ -96,22 +100,26 @@ class Cost:
 
 def measure(
     candidates: Mapping[str, Callable[[], Field]],
-    points: Tensor,
+    points: Tensor | Mapping[str, Tensor],
     *,
     order: int = 1,
     seconds: float = 2.0,
+    clock: Clock | None = None,
     tick: Tick = lambda _: None,
 ) -> dict[str, Cost]:
     """What each candidate costs, on as many threads as torch is set to, without derivatives being recorded.
 
     Args:
         candidates: name -> builds the field, from samples that exist before: all that it does counts as building.
-        points: world points `(P, 3)` (for batched fields `(N, P, 3)`) at which every candidate is evaluated. Their
-            order in space counts: points along rays read memory that is near, random ones do not.
+        points: world points `(P, 3)` (for batched fields `(N, P, 3)`) at which every candidate is evaluated; or those
+            of each candidate by its name, to compare precisions (float64 points are computed in float64) or devices.
+            Their order in space counts: points along rays read memory that is near, random ones do not.
         order: of the jets that are timed: 0 values, 1 values and gradients, 2 Hessians too.
         seconds: about how long it may take, half of it for building and half for sampling. Where that does not suffice
             for three rounds it takes longer; first calls, which compile and load, are not counted and come
             on top.
+        clock: default: `time.perf_counter`. `time.process_time` does not see the time in which the core worked for
+            others; it adds up all threads.
         tick: told which fraction is done.
 
     All fields are kept until the end: memory is the sum of their coefficients, and of one more while they are built.
@@ -122,19 +130,20 @@ def measure(
     Raises:
         ValueError: no points, or points that the fields refuse.
     """
-    if points.numel() == 0:
-        raise ValueError(f"expected points (P, 3) with P ≥ 1 to sample at; got shape {tuple(points.shape)}")
+    where = {name: points if isinstance(points, Tensor) else points[name] for name in candidates}
+    for name, p in where.items():
+        if p.numel() == 0:
+            raise ValueError(f"expected points (P, 3) with P ≥ 1 to sample {name} at; got shape {tuple(p.shape)}")
     with torch.no_grad():
-        builds = {name: _finished(build, points.device) for name, build in candidates.items()}
+        builds = {name: _finished(build, where[name].device) for name, build in candidates.items()}
         fields = {name: build() for name, build in builds.items()}
-        jets = {name: _finished(_jet(field, points, order), points.device) for name, field in fields.items()}
+        jets = {name: _finished(_jet(f, where[name], order), where[name].device) for name, f in fields.items()}
         for jet in jets.values():
             jet()
-        building = take_turns(builds, seconds=seconds / 2, tick=lambda done: tick(done / 2))
-        sampling = take_turns(jets, seconds=seconds / 2, tick=lambda done: tick((1 + done) / 2))
-    samples = points.numel() // 3
+        building = take_turns(builds, seconds=seconds / 2, clock=clock, tick=lambda done: tick(done / 2))
+        sampling = take_turns(jets, seconds=seconds / 2, clock=clock, tick=lambda done: tick((1 + done) / 2))
     return {
-        name: _cost(field, building.seconds[name], [1e9 * s / samples for s in sampling.seconds[name]])
+        name: _cost(field, building.seconds[name], [3e9 * s / where[name].numel() for s in sampling.seconds[name]])
         for name, field in fields.items()
     }
 
@@ -189,7 +198,7 @@ def take_turns(
     clock = clock or time.perf_counter
     warm = {name: _seconds(call, 1, time.perf_counter) for name, call in calls.items()}
     times = {name: max(1, math.ceil(SHORTEST / max(t, 1e-7))) for name, t in warm.items()}
-    one_round = sum(times[name] * t for name, t in warm.items())
+    one_round = sum((times[name] + times[name] // 2) * t for name, t in warm.items())
     affordable = int(seconds / max(one_round, 1e-9))
     number = max(min(rounds, affordable), min(rounds, least)) if calls else 0
     taken: dict[str, list[float]] = {name: [] for name in calls}
@@ -197,17 +206,25 @@ def take_turns(
         wall, cpu = time.perf_counter(), time.process_time()
         for r in range(number):
             for i, (name, call) in enumerate(calls.items()):
-                taken[name].append(_seconds(call, times[name], clock))
+                _seconds(call, times[name] // 2, clock)  # who went before left its own data in the caches
+                taken[name].append(_turn(call, times[name], clock))
                 tick((r + (i + 1) / len(calls)) / number)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return Rounds(taken, times, cpu / max(wall, 1e-9))
+
+
+def _turn(call: Callable[[], Any], times: int, clock: Clock) -> float:
+    """Seconds per call: the median of batches, so that a disturbance shorter than the turn does not count."""
+    number = min(times, BATCHES)
+    sizes = [times // number + (i < times % number) for i in range(number)]
+    return statistics.median([_seconds(call, size, clock) for size in sizes])
 
 
 def _seconds(call: Callable[[], Any], times: int, clock: Clock) -> float:
     start = clock()
     for _ in range(times):
         call()
-    return (clock() - start) / times
+    return (clock() - start) / max(times, 1)
 
 
 @contextmanager

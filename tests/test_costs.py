@@ -50,6 +50,23 @@ def test_what_is_fast_is_called_until_a_turn_is_long_enough(monkeypatch):
     assert rounds.seconds["A"] == pytest.approx([costs.SHORTEST / 4] * 2)
 
 
+def test_a_turn_of_many_calls_begins_with_some_that_do_not_count(monkeypatch):
+    """Who went before left its own data in the caches: the first calls of a turn are slow."""
+    clock, usual = Clock(monkeypatch), costs.SHORTEST / 4
+    rounds = take_turns({"A": clock.call("A", usual, 9.0, 9.0, usual)}, seconds=1, rounds=1)
+    assert len(clock.calls) == 1 + 2 + 4
+    assert rounds.seconds["A"] == pytest.approx([usual])
+
+
+def test_what_disturbs_some_calls_of_a_turn_does_not_count(monkeypatch):
+    clock, usual = Clock(monkeypatch), costs.SHORTEST / 20
+    call = clock.call("A", *[usual] * 15, 50.0, *[usual] * 9, 7.0, usual)
+    rounds = take_turns({"A": call}, seconds=1e6, rounds=1)
+    assert rounds.calls == {"A": 20}
+    assert len(clock.calls) == 1 + 10 + 20
+    assert rounds.seconds["A"] == pytest.approx([usual])
+
+
 @pytest.mark.parametrize(("seconds", "number"), [(100, 9), (16, 5), (1, 3)])
 def test_rounds_are_as_many_as_the_time_allows_but_never_too_few(monkeypatch, seconds, number):
     clock = Clock(monkeypatch)
@@ -140,9 +157,25 @@ def test_a_slow_first_call_is_not_taken_for_the_usual_one(monkeypatch):
     assert len(field.asked) > 40 * costs.ROUNDS
 
 
+def test_another_clock_can_be_asked(monkeypatch):
+    clock = Clock(monkeypatch)
+    found = measure({"A": lambda: Counting(clock)}, torch.rand(10, 3), seconds=0.1, clock=lambda: 2 * clock.now)
+    assert found["A"].sample.median == pytest.approx(2000)
+
+
 def test_no_points_are_refused_before_anything_is_built():
     def build():
         raise AssertionError("built")
 
-    with pytest.raises(ValueError, match=r"P ≥ 1 to sample at; got shape \(0, 3\)"):
+    with pytest.raises(ValueError, match=r"P ≥ 1 to sample A at; got shape \(0, 3\)"):
         measure({"A": build}, torch.empty(0, 3))
+
+
+def test_every_candidate_may_have_points_of_its_own(monkeypatch):
+    clock = Clock(monkeypatch)
+    fields = {"A": Counting(clock), "B": Counting(clock)}
+    points = {"A": torch.rand(10, 3), "B": torch.rand(1000, 3, dtype=torch.float64)}
+    found = measure({name: lambda name=name: fields[name] for name in fields}, points, seconds=0.1)
+    assert [found[name].sample.median for name in fields] == pytest.approx([1000, 1000])
+    with pytest.raises(ValueError, match="to sample B at"):
+        measure({"A": lambda: fields["A"], "B": lambda: fields["B"]}, {**points, "B": points["B"][:0]})
