@@ -33,6 +33,7 @@ ROLES: tuple[Role, ...] = ("training", "validation", "test")
 
 _PARTS = {"training": (0.0, 0.5), "validation": (0.5, 0.65), "test": (0.65, 1.0)}  # of a scan, along its longest axis
 _MARGIN = 6  # coarse voxels around the points of a scan, as far as seven taps and a kernel see
+_CONTENT, _DRAWS = 0.1, 100  # a piece varies by this share of what the scan does, or so many draws found no such one
 _LARGEST = 256  # voxels along an axis of a scan that are used, from its middle: bounds the memory
 _SHARPEST, _REACH = 0.42 * math.pi, 12  # of the low-pass before a scan is decimated: nothing is left beyond π/2
 
@@ -279,7 +280,7 @@ class Scan:
             padded = Boundary.MIRROR.extend(padded, dim, _MARGIN, _MARGIN)
         pieces, placed, truths = [], [], []
         for _ in range(count):
-            start, size = self._box(role, generator)
+            start, size = self._box_with_content(role, generator)
             pieces.append(padded[tuple(slice(s, s + n + 2 * _MARGIN) for s, n in zip(start, size, strict=True))])
             corner, extent = (padded.new_tensor(v[::-1]) for v in (start, size))
             local = torch.rand(points, 3, generator=generator, dtype=torch.float64).to(padded)
@@ -292,6 +293,17 @@ class Scan:
             torch.stack([value for value, _ in truths]),
             2 * torch.stack([gradient for _, gradient in truths]),
         )
+
+    def _box_with_content(self, role: Role, generator: torch.Generator) -> tuple[list[int], list[int]]:
+        """A box as `_box` draws them, drawn again while there is next to nothing in it: air tells no filter apart."""
+        least = _CONTENT * float(self.coarse.std())
+        start, size = self._box(role, generator)
+        for _ in range(_DRAWS):
+            inside = self.coarse[tuple(slice(s, s + n) for s, n in zip(start, size, strict=True))]
+            if float(inside.std()) >= least:
+                break
+            start, size = self._box(role, generator)
+        return start, size
 
     def _box(self, role: Role, generator: torch.Generator) -> tuple[list[int], list[int]]:
         """(first voxel, voxels) along z, y, x of a piece at random within the role's part of the coarse volume."""

@@ -38,15 +38,13 @@ def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section
 
 
 def _lead(config: Config) -> tuple[str, ...]:
-    weight = (
-        "the value's error alone is minimised"
-        if config.gradient_weight == 0
-        else f"what is minimised is the squared error of the value and {config.gradient_weight:g} times that of the "
-        f"gradient, both relative to those of {config.reference.key}"
-    )
+    minimised = "the squared error of the value"
+    if config.gradient_weight > 0:
+        minimised = f"the squared errors of value and gradient (weights 1 and {config.gradient_weight:g})"
+    minimised += f", relative to {config.reference.key}"
     return (
         "A kernel with a short symmetric prefilter, or the family of kernels with parameters B and C, is fitted to "
-        f"members of a class of signals by gradient descent: {weight}. {config.training} members train, "
+        f"members of a class of signals by gradient descent on {minimised}. {config.training} members train, "
         f"{config.validation} others say where to stop and which filter to choose, and {config.test} more, which had "
         f"no say in anything, judge. All of it is repeated {config.repetitions} times with other training and "
         "validation members.",
@@ -54,6 +52,8 @@ def _lead(config: Config) -> tuple[str, ...]:
         "Catmull-Rom, Mitchell and the tricubic B-spline. The prefilter is paid once per voxel and not per value, and "
         "is stated apart. “Better” and “worse” mean: by at least 1 % over all test members in every repetition, and so "
         "on at least nine of ten single members; everything else is “mixed”.",
+        "An RMS error is one measure of several. The notch, for one, is made to leave no staircases: it gives up "
+        "sharpness for the least postaliasing, which the tables below show beside the errors.",
     )
 
 
@@ -68,28 +68,27 @@ def _verdict_in_words(verdicts: Sequence[Record]) -> list[str]:
         equal = [name for name, costs_as_much in rivals.items() if costs_as_much]
         if equal:
             listed = " and ".join(filter(None, [", ".join(equal[:-1]), equal[-1]]))
-            sentences.append(f"{taps} taps against {listed}: {_outcome(verdicts, taps, equal)}.")
+            best = ", in each class the best of them" if len(equal) > 1 else ""
+            sentences.append(f"Learned, {taps} taps, against {listed}{best}: {_outcome(verdicts, taps, equal)}.")
         if rivals.get("tricubic") is False:
-            against = f"{taps} taps against the {fl.METHODS['tricubic'].facts.taps} of tricubic"
+            against = f"Learned, {taps} taps, against tricubic with its {fl.METHODS['tricubic'].facts.taps}"
             sentences.append(f"{against}: {_outcome(verdicts, taps, ['tricubic'])}.")
     return sentences
 
 
 def _outcome(verdicts: Sequence[Record], taps: int, rivals: Sequence[str]) -> str:
-    """In how many classes the learned filter beats all of these, and by how much the best of them."""
+    """In how many classes the learned filter beats the one of these that is hardest to beat there, and by how much."""
     parts = []
     for quantity in QUANTITIES:
         hardest = [
             max((a[quantity] for a in against if a["recipe"] in rivals), key=lambda o: o["ratio"])
             for against in _against(verdicts, taps)
         ]
-        better, mixed, worse = (sum(o["verdict"] == word for o in hardest) for word in (BETTER, MIXED, WORSE))
-        counts = [f"better in {better} of {len(hardest)} classes"]
-        counts += [f"{word} in {count}" for word, count in ((MIXED, mixed), (WORSE, worse)) if count]
+        counts = {word: sum(o["verdict"] == word for o in hardest) for word in (BETTER, MIXED, WORSE)}
+        said = [f"{word} in {count}" for word, count in counts.items() if count or word == BETTER]
         changes = sorted(100 * (o["ratio"] - 1) for o in hardest)
-        parts.append(f"by {quantity} {', '.join(counts)} (error {_signed(changes[0])} … {_signed(changes[-1])})")
-    of_the_best = " than that of the best of them" if len(rivals) > 1 else ""
-    return "; ".join(parts) + of_the_best.replace(" than", ", against")
+        parts.append(f"by {quantity} {', '.join(said)} (error {_signed(changes[0])} … {_signed(changes[-1])})")
+    return f"of {len(hardest)} classes " + "; ".join(parts)
 
 
 def _signed(change: float, decimals: int = 0) -> str:
@@ -168,7 +167,7 @@ def _ratio_table(config: Config, verdicts: Sequence[Record], taps: int) -> Table
     """One row for each class: the chosen filter, and for each rival of that cost the change of both errors."""
     rivals = [name for name, equal in _rivals(verdicts, taps).items() if equal or name == "tricubic"]
     columns = [Column("class", numeric=False), Column(f"chosen, {taps} taps", numeric=False)]
-    columns += [Column(f"against {rival}" if q == "value" else "", q) for rival in rivals for q in QUANTITIES]
+    columns += [Column(rival if q == "value" else "", q) for rival in rivals for q in QUANTITIES]
     rows = []
     for v in verdicts:
         for choice in (c for c in v["choices"] if c["taps"] == taps):
@@ -176,8 +175,8 @@ def _ratio_table(config: Config, verdicts: Sequence[Record], taps: int) -> Table
             cells = [_outcome_cell(against[r][q]) for r in rivals for q in QUANTITIES]
             rows.append([v["title"], learned_name(choice), *cells])
     caption = (
-        f"How much smaller (−) or larger (+) the test error of the chosen filter of {taps} taps is. "
-        "No mark: better; ≈: mixed, less than 1 % apart or not on nine of ten members; ▲: worse."
+        f"How much smaller (−) or larger (+) the test error of the chosen filter of {taps} taps is than those of named "
+        "methods. No mark: better; ≈: mixed, less than 1 % apart or not on nine of ten members; ▲: worse."
     )
     return Table(columns, rows, caption)
 

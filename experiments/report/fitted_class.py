@@ -28,6 +28,7 @@ KERNELS = {  # a kernel in words, and the method whose colour it has
 }
 DASHES = {1: ":", 3: (0, (1, 1.5)), 5: "--"}  # by taps of the prefilter; more: solid
 LEARNED = {"color": OTHERS[0].light, "linewidth": 1.1}
+SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 FLOOR = 1e-4  # of the error kernels that are drawn
 
 
@@ -41,7 +42,7 @@ def class_blocks(config: Config, records: Sequence[Record], folder: Path) -> lis
     if by_kind["spectrum"]:
         blocks.append(_spectrum(by_kind["spectrum"][0], folder))
     if fits:
-        blocks += [_parameters(config, fits), _convergence(config, fits)]
+        blocks += [*_parameters(config, fits), _convergence(config, fits)]
     return blocks
 
 
@@ -114,28 +115,44 @@ def _prefilter(record: Record) -> str:
     return f"{kind}: {record['multiplications']}"
 
 
-def _parameters(config: Config, fits: Sequence[Record]) -> Table:
-    most = max((len(f["parameters"].get("taps", [])) for f in fits), default=0)
+def _parameters(config: Config, fits: Sequence[Record]) -> list[Table]:
+    """Of all candidates: B and C where they are learned, then the prefilters and how the descent ended."""
+    groups = _groups(config, fits)
+    family = [own for own in groups if "bc" in own[0]["parameters"]]
+    return [*([_family(family)] if family else []), _prefilters(groups)]
+
+
+def _family(groups: Sequence[Sequence[Record]]) -> Table:
     columns = [Column("learned", numeric=False), Column("B"), Column("C"), Column("2C + B")]
-    columns += [Column(f"h{str(k).translate(str.maketrans('0123456789', '₀₁₂₃₄₅₆₇₈₉'))}") for k in range(most + 1)]
-    columns += [Column("steps"), Column("last tenth")]
     rows = []
-    for own in _groups(config, fits):
-        family = [[f["parameters"]["bc"] for f in own]] if own[0]["kernel"] == "bc" else []
-        cells = [_spread([p[i] for p in listed], 3) for listed in family for i in (0, 1)]
-        cells += [_spread([2 * p[1] + p[0] for p in listed], 3) for listed in family]
-        taps = [f["parameters"].get("taps", []) for f in own]
-        symmetric = [[1 - 2 * sum(t), *t] for t in taps] if taps[0] else [[] for _ in taps]
-        cells += [MISSING] * (3 - len(cells))
-        cells += [_spread([t[k] for t in symmetric], 3) for k in range(len(symmetric[0]))]
-        cells += [MISSING] * (3 + most + 1 - len(cells))
-        falling = f"−{fixed(100 * max(f['falling'] or 0 for f in own), 1)} %"
-        rows.append([learned_name(own[0]), *cells, text(mean(f["iteration"] for f in own)), falling])
+    for own in groups:
+        pairs = [f["parameters"]["bc"] for f in own]
+        numbers = ([b for b, _ in pairs], [c for _, c in pairs], [2 * c + b for b, c in pairs])
+        rows.append([learned_name(own[0]), *(_spread(listed, 3) for listed in numbers)])
     caption = (
-        "What was learned, mean ± standard deviation over repetitions. h₀, h₁, …: the prefilter, symmetric, of sum 1. "
-        "2C + B is 1 for kernels that reproduce quadratics. Steps: after how many the validation members were best. "
-        "Last tenth: what the last tenth of all steps took off the training objective, at most: little means that the "
-        "descent has arrived."
+        "What was learned of the kernel, mean ± standard deviation over repetitions. 2C + B is 1 for kernels that "
+        "reproduce quadratics without a prefilter: Mitchell and Catmull-Rom among them."
+    )
+    return Table(columns, rows, caption)
+
+
+def _prefilters(groups: Sequence[Sequence[Record]]) -> Table:
+    most = max(len(own[0]["parameters"].get("taps", [])) for own in groups)
+    columns = [Column("learned", numeric=False), *(Column(f"h{str(k).translate(SUBSCRIPTS)}") for k in range(most + 1))]
+    columns += [Column("steps", "mean"), Column("still falling", "by last tenth")]
+    rows = []
+    for own in groups:
+        taps = [f["parameters"].get("taps", []) for f in own]
+        symmetric = [[1 - 2 * sum(t), *t] if t else [] for t in taps]
+        cells = [_spread(listed, 3) for listed in zip(*symmetric, strict=True)]
+        cells += [MISSING] * (most + 1 - len(cells))
+        falling = max(f["falling"] or 0 for f in own)
+        steps = fixed(mean(f["iteration"] for f in own), 0)
+        rows.append([learned_name(own[0]), *cells, steps, f"{fixed(100 * falling, 1)} %"])
+    caption = (
+        "What was learned of the prefilters, mean ± standard deviation over repetitions: symmetric, of sum 1. Steps: "
+        "after how many the validation members were best. Still falling: what the last tenth of the steps took off the "
+        "training objective, at most; little means that the descent has arrived."
     )
     return Table(columns, rows, caption)
 
@@ -161,8 +178,9 @@ def _spectrum(record: Record, folder: Path) -> Plot:
     caption = (
         "The chosen filters (all repetitions, thin) and the named methods that cost as much, along an axis. Left: the "
         "response of prefilter and kernel; ideal is 1 up to the Nyquist frequency (line) and 0 above. Right: the error "
-        "kernel, the RMS error of a reconstructed wave of that frequency relative to its own (Blu & Unser). Learning "
-        "gives up frequencies that the class does not hold for those that it does."
+        "kernel, the RMS error of a reconstructed wave of that frequency relative to its own (Blu & Unser). A named "
+        "prefilter makes its kernel interpolate, or exact at low frequencies; a learned one need do neither, and takes "
+        "from frequencies that matter little to the class what it gives to those that matter."
     )
     return Plot(drawn, caption)
 

@@ -50,8 +50,9 @@ TINY = {
     "points": 20,
     "test_points": 20,
     "repetitions": 2,
-    "iterations": 4,
-    "record_every": 2,
+    "iterations": 6,
+    "learning_rate": 0.6,  # so large that it goes past
+    "record_every": 1,
 }
 
 
@@ -188,6 +189,15 @@ def test_parts_of_a_scan_are_apart(scan):
     assert ends["training"][1] <= ends["validation"][0] < ends["validation"][1] <= ends["test"][0]
     assert ends["test"][1] <= 30
     assert least_extent((20, 24, 60)) == 5
+
+
+def test_pieces_of_a_scan_have_something_in_them():
+    samples = torch.zeros(16, 16, 80, dtype=torch.float64)
+    samples[:, :, 68:] = torch.rand(16, 16, 12, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    members = Scan.of(samples, Sampling(18, 1)).members("test", 12, 200, 1)
+    assert (members.values.std(1) > 0.01).all()
+    empty = Scan.of(torch.zeros(8, 8, 20, dtype=torch.float64), Sampling(18, 1)).members("test", 1, 5, 1)
+    assert (empty.values == 0).all()
 
 
 # --- objective and known optima ---------------------------------------------------------------------------------------
@@ -328,13 +338,26 @@ def test_records_can_be_had_again_from_the_parameters(ran):
     run = Run(folder, dict(records))
     again = compute(config, next(u for u in units(config) if u.key == "0/named"), run)
     assert again["methods"] == records["0/named"]["methods"]
-    assert fit["validation"] == min(o["validation"] for o in fit["observations"])
+    fits = [r for r in records.values() if r["kind"] == "fit"]
+    assert all(f["validation"] == min(o["validation"] for o in f["observations"]) for f in fits)
+    assert any(f["iteration"] < config.iterations for f in fits)
     B, C = parameters_of(fit["parameters"])["bc"].unbind()
     kernel = kernels.bc(B, C)
     test = config.classes[0].open(Sampling(8, config.inner)).members("test", 2, 20, seed_of(config.seed, 0, 0))
     errors = test.errors(fl.reconstruct(test.volume, kernel, boundary="reflect", prefilter=False))
     assert errors["value"] == pytest.approx(fit["test"]["value"])
     assert records["0/fit/0/bc"]["parameters"] != fit["parameters"]
+
+
+def test_the_same_seed_gives_the_same_bits(ran, tmp_path):
+    _, records = ran
+    config = Config(**TINY)
+    for key in ("0/fit/1/bc", "0/fit/1/bspline2+fir3"):
+        (tmp_path / key.replace("/", "-") / "files").mkdir(parents=True)
+        again = compute(
+            config, next(u for u in units(config) if u.key == key), Run(tmp_path / key.replace("/", "-"), {})
+        )
+        assert {k: records[key][k] for k in again} == again
 
 
 def test_verdicts_follow_from_the_records(ran):
@@ -366,7 +389,7 @@ def test_the_report_says_what_the_records_say(ran):
             choice["against"] = [{**a, "value": outcome, "gradient": outcome} for a in choice["against"]]
             turned[f"{i}/verdict"]["choices"] = [choice]
         said = " ".join(draw(config, turned, folder).sections[0].lead)
-        expected = "value better in 2 of 2 classes (error −50 %)" if word == BETTER else "worse in 2 (error +100 %)"
+        expected = "better in 2 (error −50 % … −50 %)" if word == BETTER else "better in 0, worse in 2 (error +100 %"
         assert expected in said
 
 
