@@ -52,6 +52,7 @@ class Recipe(StrictModel):
     gradient: Literal["analytic", "central"] | None = None
     scheme: Literal["direct", "fused", "eight_trilinear"] | None = None
     sampler: Literal["exact", "texture_unit"] = "exact"
+    storage: Literal["float64", "float32", "float16", "bfloat16", "int16", "int8", "uint8"] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -87,6 +88,7 @@ class Recipe(StrictModel):
             "" if self.gradient_kind == facts.gradients[0] else self.gradient_kind,
             self.scheme or "",
             "" if self.sampler == "exact" else self.sampler,
+            self.storage or "",
         ]
         return "+".join(p for p in parts if p)
 
@@ -100,6 +102,7 @@ class Recipe(StrictModel):
             gradient=self.gradient,
             scheme=self.scheme,
             sampler=self.sampler,
+            storage=self.storage,
         )
 
     def record(self) -> dict[str, Any]:
@@ -111,6 +114,7 @@ class Recipe(StrictModel):
             "gradient": self.gradient_kind,
             "scheme": self.scheme or "default",
             "sampler": self.sampler,
+            "storage": self.storage or "default",
             "default_gradient": self.gradient_kind == fl.METHODS[self.method].facts.gradients[0],
         }
 

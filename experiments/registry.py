@@ -25,6 +25,7 @@ _NAMES = (
     "texture_precision",
     "inverse_dvr",
     "fit_kernel",
+    "stability",
     "demo",
 )
 

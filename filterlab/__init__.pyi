@@ -1,4 +1,4 @@
-from . import io, kernels, metrics, prefilters, render, signals, spectrum
+from . import costs, io, kernels, metrics, prefilters, render, signals, spectrum
 from .fields.base import Field
 from .io.volumes import load_volume, save_volume
 from .kernels import KERNELS
@@ -15,6 +15,7 @@ __all__ = [
     "Field",
     "Method",
     "Volume",
+    "costs",
     "from_grid_sample",
     "from_zyx",
     "io",

@@ -101,6 +101,8 @@ class Resample:
     """Instead of it: a volume file whose grid is taken over."""
     boundary: str = "mirror"
     """How the volume goes on beyond its ends: mirror, reflect, wrap, border or zeros."""
+    nan: str = "refuse"
+    """What becomes of voxels that are NaN: refuse, propagate (NaN near them) or fill (values from around)."""
     dtype: str = "float32"
     """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN."""
     max_gigabytes: float = 8.0
@@ -123,11 +125,13 @@ class Resample:
 
         from filterlab.io.volumes import check_saveable, describe, load_volume, save_volume
         from filterlab.methods import METHODS
+        from filterlab.missing_values import CHOICES
         from filterlab.resampling import resample
         from filterlab.volume import Boundary, Volume
 
         _check_name("method", self.method, METHODS)
         _check_name("boundary", self.boundary, Boundary)
+        _check_name("nan", self.nan, CHOICES)
         source = describe(self.input)
         target = None if self.like is None else describe(self.like)
         dtype = _result_type(self.dtype, source)
@@ -140,7 +144,7 @@ class Resample:
         grid: dict = {"spacing": self.spacing} if self.spacing else {"shape": self.shape[::-1] if self.shape else None}
         if target is not None:  # a grid without samples: one voxel, shown over and over
             grid = {"like": Volume.with_geometry(torch.zeros(()).expand(target.shape[-3:]), target.geometry)}
-        result = resample(volume, self.method, boundary=self.boundary, dtype=working, **grid)
+        result = resample(volume, self.method, boundary=self.boundary, dtype=working, nan=self.nan, **grid)
         save_volume(_converted(result, dtype), self.output)
 
     def _limit(self) -> int:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from filterlab import ops
 from filterlab.fields.base import Domain, Field, check_order, check_points
+from filterlab.fields.storage import Quantization, stored_as
 from filterlab.kernels import Factor, PiecewisePolynomial
 from filterlab.ops.placement import Placement
 from filterlab.ops.prefilter import implementation_for, prefilter_samples
@@ -70,6 +71,7 @@ class Coefficients:
         size: voxels of the volume along x, y, z.
         boundary: the extension of the samples.
         tail: how far beyond the ends points are told apart (border and zeros); the extension is constant beyond.
+        quantization: what integers in `values` stand for; None: values are the coefficients themselves.
     """
 
     values: Tensor
@@ -78,12 +80,22 @@ class Coefficients:
     size: tuple[int, int, int]
     boundary: Boundary
     tail: int
+    quantization: Quantization | None = None
 
     @classmethod
     def of(
-        cls, samples: Tensor, prefilter: Prefilter, boundary: Boundary, reach: int, factor: Factor | None = None
+        cls,
+        samples: Tensor,
+        prefilter: Prefilter,
+        boundary: Boundary,
+        reach: int,
+        factor: Factor | None = None,
+        storage: torch.dtype | None = None,
+        unknown: Tensor | None = None,
     ) -> Coefficients:
-        """Prefilter, extend by the boundary, and apply the discrete part of a factored kernel.
+        """Prefilter, extend by the boundary, apply the discrete part of a factored kernel, and store.
+
+        Where `unknown`, a mask of the samples, coefficients are NaN: after the prefilter, which would spread them.
 
         Memory: (n + 2·pad)³ coefficients, pad = reach (+1 for a factored kernel) under mirror, reflect and wrap;
         under border and zeros 2·reach plus the prefilter's decay (about 10 … 50 voxels, see `Prefilter.decay`).
@@ -99,15 +111,34 @@ class Coefficients:
         if prefilter.is_identity or not boundary.periodic:
             for dim in (-3, -2, -1):
                 values = boundary.extend(values, dim, pad, pad)
+        if unknown is not None:
+            values = values.masked_fill(_extended(unknown, boundary, pad + decay), torch.nan)
         shift = 0.0
         if factor is not None:
             values, shift = _apply_factor(values, factor), 0.5
+        values, quantization = stored_as(values, storage)
         d, h, w = samples.shape[-3:]
-        return cls(values, -(pad + decay), shift, (w, h, d), boundary, tail)
+        return cls(values, -(pad + decay), shift, (w, h, d), boundary, tail, quantization)
+
+    def __getitem__(self, index: tuple[int, int]) -> Coefficients:
+        """Those of entry n and channel c of a batch."""
+        quantization = None if self.quantization is None else self.quantization[index]
+        return replace(self, values=self.values[index], quantization=quantization)
+
+    def decoded(self, dtype: torch.dtype) -> Tensor:
+        """The coefficients as numbers of a floating type."""
+        values = self.values
+        return values.to(dtype) if self.quantization is None else self.quantization.decoded(values, dtype)
 
     def placement(self, geometry: Geometry) -> Placement:
         """How world points become coordinates of these coefficients."""
         return Placement(geometry, self.boundary, self.size, self.tail, self.shift)
+
+
+def _extended(mask: Tensor, boundary: Boundary, reach: int) -> Tensor:
+    for dim in (-3, -2, -1):
+        mask = boundary.extend(mask, dim, reach, reach)
+    return mask
 
 
 def implementation_of(scheme: str, device: torch.device) -> str:
@@ -164,7 +195,7 @@ class GridField(Field):
         if self.channels is None:
             raise ValueError("select needs a batched field, of a volume (N, C, D, H, W); this one is unbatched")
         one = copy(self)
-        one.coefficients = replace(self.coefficients, values=self.coefficients.values[n, c])
+        one.coefficients = self.coefficients[n, c]
         one.channels = None
         return one
 
@@ -198,7 +229,9 @@ class GridField(Field):
         if shared:
             values = values.reshape(1, n * c, *values.shape[2:])
         rows = self.scheme.jet(replace(self.coefficients, values=values), located, order)
-        return rows.reshape(n, c, *rows.shape[2:]) if shared else rows
+        rows = rows.reshape(n, c, *rows.shape[2:]) if shared else rows
+        quantization = self.coefficients.quantization
+        return rows if quantization is None else quantization.of_rows(rows)
 
     def _shaped(self, x: Tensor, shape: Sequence[int]) -> Tensor:
         """(N, C, M, ...) to (N, C, *P, ...), or (*P, ...) for an unbatched field."""

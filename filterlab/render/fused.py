@@ -22,6 +22,7 @@ from filterlab.ops.stencil import Stencil
 from filterlab.render.bricks import bricks_of
 from filterlab.render.plain import Chords, Medium, PlainMarcher, Report
 from filterlab.render.shading import Light, Shading, safe_normalize
+from filterlab.render.transfer import TransferFunction
 
 SKIPPING = True
 """Whether empty space is left out; it changes no bit of the image."""
@@ -39,6 +40,8 @@ def can_be_fused(medium: Medium) -> bool:
         return False
     values, start = field.coefficients.values, field.coefficients.start
     if medium.transfer.positions.device != values.device or (medium.differentiable and march.on_gpu(values)):
+        return False
+    if bool((_of_stored(medium).positions.detach().diff() <= 0).any()):  # rounded to one number
         return False
     lights = len(medium.shading.lights) if medium.shading else 0
     return march.missing(values[(0,) * (values.ndim - 3)], _stencil(medium), start, medium.dtype, lights) is None
@@ -89,7 +92,18 @@ def _empty_parts(medium: Medium) -> Bricks | None:
     if not SKIPPING:
         return None
     assert isinstance(medium.field, GridField)
-    return bricks_of(medium.field.coefficients.values, _stencil(medium), medium.transfer)
+    return bricks_of(medium.field.coefficients.values, _stencil(medium), _of_stored(medium))
+
+
+def _of_stored(medium: Medium) -> TransferFunction:
+    """The transfer function of what the coefficients' stored numbers sum to; another one only for integers."""
+    assert isinstance(medium.field, GridField)
+    quantization = medium.field.coefficients.quantization
+    if quantization is None:
+        return medium.transfer
+    transfer = copy(medium.transfer)
+    transfer.positions = quantization.stored(transfer.positions)
+    return transfer
 
 
 class _Given:
@@ -211,7 +225,7 @@ def _in_place_of(needed: Sequence[bool], derivatives: Sequence[Tensor | None]) -
 
 
 def _prepared(medium: Medium, chords: Chords, empty: Bricks | None) -> march.March:
-    field, transfer, stencil = medium.field, medium.transfer, _stencil(medium)
+    field, transfer, stencil = medium.field, _of_stored(medium), _stencil(medium)
     assert isinstance(field, GridField)
     coefficients = field.coefficients
     return march.March(
@@ -256,6 +270,8 @@ def _lighting(field: GridField, shading: Shading, direction: Tensor, dtype: torc
             toward.append(to_light.expand_as(view))
             halfway.append(safe_normalize(to_light + view))
     world = field.domain.geometry.gradient_to_world(torch.eye(3, dtype=torch.float64)).to(view)
+    if field.coefficients.quantization is not None:
+        world = world * field.coefficients.quantization.scale.to(view)
     return march.Lighting(
         ambient,
         shininess,

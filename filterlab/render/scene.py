@@ -185,6 +185,8 @@ class Reconstruction(StrictModel):
     boundary: Annotated[str, AfterValidator(_known_boundary)] = "mirror"
     gradient: str | None = None
     sampler: Literal["exact", "texture_unit"] = "exact"
+    storage: Literal["float64", "float32", "float16", "bfloat16", "int16", "int8", "uint8"] | None = None
+    nan: Literal["refuse", "propagate", "fill"] = "refuse"
 
     @model_validator(mode="before")
     @classmethod
@@ -206,6 +208,8 @@ class Reconstruction(StrictModel):
             scheme=self.scheme,
             gradient=self.gradient,
             sampler=self.sampler,
+            storage=self.storage,
+            nan=self.nan,
         )
 
 
