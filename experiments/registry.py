@@ -26,6 +26,7 @@ _NAMES = (
     "inverse_dvr",
     "speed_accuracy",
     "equal_error",
+    "fit_kernel",
     "stability",
     "demo",
 )

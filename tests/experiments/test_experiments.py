@@ -96,6 +96,19 @@ def tiny(name, scan):
                 "rays": 20,
             },
         },
+        "fit_kernel": {
+            "classes": [{"kind": "waves", "title": "waves", "bandwidth": 0.5, "waves": 4}],
+            "candidates": [{"kernel": "notch", "prefilter": 3}],
+            "methods": ["triquadratic", "notch"],
+            "resolution": 6,
+            "training": 1,
+            "validation": 1,
+            "test": 1,
+            "points": 10,
+            "test_points": 10,
+            "repetitions": 1,
+            "iterations": 2,
+        },
     }
     configs["equal_error"] = {
         "studies": [{"signal": {"name": "gaussian", "parameters": {"sigma": 0.5}}}],
