@@ -15,7 +15,7 @@ pytest.importorskip("triton", reason="the package triton is not installed")
 from filterlab.kernels import LINEAR, bspline
 from filterlab.methods import reconstruct
 from filterlab.ops import Stencil, march
-from filterlab.ops.cuda import launch
+from filterlab.ops.cuda import launch, program
 from filterlab.ops.cuda import march as cuda
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.bricks import bricks_of
@@ -125,7 +125,7 @@ def test_ends_behind_what_is_opaque(device: str) -> None:
 
 @pytest.mark.parametrize("points", [1, 2, 6])
 def test_any_number_of_control_points(points: int, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda, "BLOCK", 4)  # and of programs: one for every row of the image
+    monkeypatch.setattr(program, "BLOCK", 4)  # and of programs: one for every row of the image
     x = torch.linspace(0.2, 0.8, points, dtype=torch.float64)
     generator = torch.Generator().manual_seed(points)
     rgb, alpha = (torch.rand(points, *more, generator=generator, dtype=torch.float64) for more in ((3,), ()))
@@ -209,8 +209,8 @@ def test_compiles_for_a_gpu_that_need_not_be_there(monkeypatch: pytest.MonkeyPat
     types = dict.fromkeys(("coefficients", "inner", "opacities", "colors", "shading", "view", "world"), "*fp32")
     types |= dict.fromkeys(("entry", "direction", "length", "offset", "numbers", "light", "optical_depth"), "*fp64")
     types |= {"count": "*i64", "bricks": "*u8", "BLOCK": "constexpr"}
-    program = launch.launchable(cuda.Recipe(Stencil.jet(LINEAR, 1).lowered, 1, skipping=True).write())
-    source = ASTSource(program, {p.name: types.get(p.name, "i32") for p in program.params}, {"BLOCK": cuda.BLOCK})
+    written = launch.launchable(cuda.Recipe(Stencil.jet(LINEAR, 1).lowered, 1, skipping=True).write())
+    source = ASTSource(written, {p.name: types.get(p.name, "i32") for p in written.params}, {"BLOCK": program.BLOCK})
     made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})
     assert "bar.sync" not in made.asm["ptx"]  # one warp waits for nobody
 
