@@ -74,7 +74,7 @@ def _of_table(rows: Tensor, points: int) -> dict[str, Tensor]:
 
 
 def _of_shading(shading: Tensor, view: Tensor, lights: int) -> dict[str, Tensor]:
-    tints, vectors = shading[2:].reshape(lights, 2, 3), view.reshape(-1, lights, 2, 3)
+    tints, vectors = shading[2:].reshape(lights, 2, 3), view.reshape(len(view), lights, 2, 3)
     return {
         "ambient": shading[0],
         "shininess": shading[1],

@@ -33,7 +33,7 @@ from filterlab.ops.cuda.optics import RGB, Located
 from filterlab.ops.cuda.program import Program, launch
 from filterlab.ops.cuda.source import Source
 from filterlab.ops.cuda.tape import Node, Tape
-from filterlab.ops.cuda.taps import AXES, Taps
+from filterlab.ops.cuda.taps import AXES
 from filterlab.ops.derivatives import TABLE_ROW, by_name, columns_of_rays, gradient_columns
 from filterlab.ops.stencil import Lowered
 
@@ -51,6 +51,7 @@ class Recipe:
     Attributes:
         gradients: what is asked, of `ops.derivatives.GRADIENTS`.
         derivatives: the stencil of its rows' derivatives, and `raised` as in `Stencil.derivatives`; for "rays".
+        tables: how many there are.
     """
 
     gradients: tuple[str, ...]
@@ -58,10 +59,11 @@ class Recipe:
     derivatives: tuple[Lowered, tuple[tuple[int, ...], ...]] | None
     lights: int | None
     skipping: bool
+    tables: int = TABLES
 
     @property
     def own(self) -> tuple[str, ...]:
-        """Shapes as in `ops.cpu.march.FIELDS`, but for the tables, (TABLES, intervals, 12)."""
+        """Shapes as in `ops.cpu.march.FIELDS`, but for the tables, (tables, intervals, 12)."""
         targets = {"coefficients": "coefficient_gradient", "table": "table_gradient"}
         by_ray = ("ray_gradient",) if {"rays", "shading"} & set(self.gradients) else ()
         asked = tuple(target for name, target in targets.items() if name in self.gradients)
@@ -155,7 +157,7 @@ class _Adjoint(Program):
             self.line(f"held_{k} += tl.where(near, {end.adjoint}, 0.0)")
 
     def _let_go(self, mask: str) -> None:
-        self.line(f"table = tl.program_id(0).to(tl.int64) % {TABLES} * (inner_points + 1) + held")
+        self.line(f"table = tl.program_id(0).to(tl.int64) % {self.recipe.tables} * (inner_points + 1) + held")
         for k in range(_ENDS):
             address = f"table_gradient + {TABLE_ROW} * table + {k}"
             self.line(f'tl.atomic_add({address}, held_{k}.to(tl.float64), {mask}, sem="relaxed")')
@@ -181,7 +183,7 @@ class _Adjoint(Program):
         """Points are entry + t direction, t the middle of a segment; the last segment ends where the ray does."""
         assert self.recipe.derivatives is not None
         stencil, raised = self.recipe.derivatives
-        taps = Taps(self.source, stencil)
+        taps = self.taps_of(stencil)
         taps.weigh()  # in place of the others, which are needed no more
         taps.contract("first", "slope")
         for k, axis in enumerate(AXES):
@@ -240,4 +242,5 @@ def _recipe(march: March, gradients: tuple[str, ...]) -> Recipe:
         None if raised is None else (raised[0].lowered, raised[1]),
         None if march.lighting is None else march.lighting.lights,
         march.bricks is not None,
+        TABLES,
     )

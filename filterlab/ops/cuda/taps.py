@@ -40,11 +40,14 @@ class Taps:
 
     Names that the source must have: `width`, `height`, `depth`, `start` (the coordinate of coefficient 0) as 64-bit
     integers, and `arithmetic`, the dtype of points and sums.
+
+    Args:
+        written_out: the largest number of taps whose planes are written out.
     """
 
-    def __init__(self, source: Source, stencil: Lowered) -> None:
+    def __init__(self, source: Source, stencil: Lowered, written_out: int = WRITTEN_OUT) -> None:
         self.source, self.stencil = source, stencil
-        self.written_out = math.prod(stencil.supports) <= WRITTEN_OUT
+        self.written_out = math.prod(stencil.supports) <= written_out
 
     # --- where the points read, and with which weights ---
 
