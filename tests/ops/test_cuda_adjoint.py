@@ -12,7 +12,7 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="the package triton is not installed")
 
-from filterlab.kernels import LINEAR
+from filterlab.kernels import LINEAR, bspline
 from filterlab.methods import reconstruct
 from filterlab.ops import Stencil, march
 from filterlab.ops.cuda import adjoint, launch, program
@@ -66,8 +66,10 @@ def assert_same(found: dict[str, Tensor], expected: dict[str, Tensor], tolerance
     assert found.keys() == expected.keys()
     for name, x in expected.items():
         assert found[name].dtype == x.dtype, name
-        limit = tolerance * float(x.abs().max()) if x.numel() else 0
-        torch.testing.assert_close(found[name], x, rtol=0, atol=limit, msg=lambda text, name=name: f"{name}: {text}")
+        limit = tolerance * float(x.nan_to_num().abs().max()) if x.numel() else 0
+        torch.testing.assert_close(
+            found[name], x, rtol=0, atol=limit, equal_nan=True, msg=lambda text, name=name: f"{name}: {text}"
+        )
 
 
 def assert_agrees(prepared: march.March, device: str) -> dict[str, Tensor]:
@@ -104,6 +106,14 @@ def test_behind_what_is_opaque(device: str) -> None:
     marched = prepared("trilinear", transfer, shading=LIT)
     assert (marched.run()[1] == math.inf).any()
     assert all(x.isfinite().all() for x in assert_agrees(marched, device).values())
+
+
+def test_a_voxel_of_nan_poisons_the_same_derivatives(device: str) -> None:
+    samples = torch.rand((9, 9, 9), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    samples[4, 6, 5] = math.nan
+    found = assert_agrees(prepared("trilinear", samples=samples, size=(9, 8)), device)
+    for name in ("coefficients", "entry"):
+        assert 0 < found[name].isnan().double().mean() < 0.1
 
 
 @pytest.mark.parametrize("points", [1, 2, 6])
@@ -239,25 +249,33 @@ def test_derivatives_of_an_image_are_the_plain_marchers(device: str, monkeypatch
 # --- compilation ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", ["fp32", "fp64"])
-def test_compiles_for_a_gpu_that_need_not_be_there(number: str, monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("stencil", "lights", "number", "stored", "taps"),
+    [
+        (Stencil.jet(LINEAR, 1), 1, "fp32", "fp16", 8),
+        (Stencil.jet(bspline(2), 0), None, "fp64", "i16", 27),  # in loops over planes
+    ],
+    ids=["lit", "unlit"],
+)
+def test_compiles_for_a_gpu_that_need_not_be_there(
+    stencil: Stencil, lights: int | None, number: str, stored: str, taps: int, monkeypatch: pytest.MonkeyPatch, tmp_path
+) -> None:
     """The interpreter takes what the compiler would refuse; machine code needs no GPU to be made."""
     from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]
     from triton.compiler import ASTSource, compile  # pyright: ignore[reportMissingImports]
 
     monkeypatch.setenv("TRITON_INTERPRET", "0")
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
-    stencil = Stencil.jet(LINEAR, 1)
     derivatives, raised = stencil.derivatives
-    recipe = adjoint.Recipe(GRADIENTS, stencil.lowered, (derivatives.lowered, raised), 1, skipping=True)
+    recipe = adjoint.Recipe(GRADIENTS, stencil.lowered, (derivatives.lowered, raised), lights, skipping=True)
     types = dict.fromkeys(program.arrays_of(recipe), "*fp64")
     numbers = ("inner", "opacities", "colors", "shading", "view", "world", "coefficient_gradient")
     types |= dict.fromkeys(numbers, f"*{number}")
-    types |= {"coefficients": "*fp16", "count": "*i64", "bricks": "*u8", "BLOCK": "constexpr"}
+    types |= {"coefficients": f"*{stored}", "count": "*i64", "bricks": "*u8", "BLOCK": "constexpr"}
     written = launch.launchable(recipe.write())
     signature = {p.name: types.get(p.name, "i32") for p in written.params}
     source = ASTSource(written, signature, {"BLOCK": program.BLOCK})
     made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})
     lines = made.asm["ptx"].splitlines()
     assert not [line for line in lines if "bar.sync" in line]  # one warp waits for nobody
-    assert sum("atom.global" in line for line in lines) == 8 + 2 * 10  # taps; what is held is let go in two places
+    assert sum("atom.global" in line for line in lines) == taps + 2 * 10  # what is held is let go in two places
