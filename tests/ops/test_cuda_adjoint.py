@@ -114,6 +114,23 @@ def test_a_voxel_of_nan_poisons_the_same_derivatives(device: str) -> None:
     found = assert_agrees(prepared("trilinear", samples=samples, size=(9, 8)), device)
     for name in ("coefficients", "entry"):
         assert 0 < found[name].isnan().double().mean() < 0.1
+    clear = prepared("trilinear", TransferFunction([0.0, 2.0], [[1.0] * 3] * 2, [0.0, 0.0]), samples, size=(9, 8))
+    light, *_ = given = results(clear)
+    assert light.isnan().any()
+    assert torch.equal(on_device(clear, device, given, ["rays"])["entry"].isnan(), light.isnan())
+
+
+def test_lanes_without_a_ray_and_rays_that_have_ended_add_nothing(device: str) -> None:
+    """The first stand at 0, the others at their end: the volume is NaN there. Neighbours go on."""
+    marched = prepared("trilinear")
+    nan = tuple(slice(k - marched.start, None) for k in (2, 4, 3))
+    marched.coefficients[nan] = math.nan
+    marched.coefficients[(-marched.start,) * 3] = math.nan
+    entry, along = torch.tensor([[1, 0.5, 1], [3.5, 0, 2.5]]).double(), torch.tensor([[0, 1, 0], [0, 1, 0]]).double()
+    length, offset, count = torch.tensor([5.0, 3.0]).double(), torch.ones(2).double(), torch.tensor([5, 3])
+    found = assert_agrees(replace(marched, rays=march.Rays(entry, along, length, offset, count), step=1.0), device)
+    assert all(x.isfinite().all() for x in found.values())
+    assert found["opacities"].abs().min() > 1e-3
 
 
 @pytest.mark.parametrize("points", [1, 2, 6])
