@@ -6,7 +6,6 @@ what slows both down in a round cancels, and a round that something else disturb
 
 from __future__ import annotations
 
-import gc
 import math
 import os
 import re
@@ -23,12 +22,9 @@ from torch import Tensor
 
 from benchmarks.records import Bar, Figure, Outcome, Spread, Timing
 from benchmarks.settings import Settings
+from filterlab.costs import Rounds, Tick, per_round, take_turns
 
 Numbers = Sequence[Tensor | np.ndarray]
-Tick = Callable[[float], None]
-"""Told which fraction of an item is done."""
-
-SHORTEST = 0.004  # seconds of a turn; faster contestants are called several times in it
 _CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 
 
@@ -213,50 +209,17 @@ def explained(error: Exception) -> str:
     return text[:300] if isinstance(error, DisagreementError) else f"{type(error).__name__}: {text}"[:300]
 
 
-@dataclass
-class _Rounds:
-    number: int
-    seconds: dict[str, list[float]]
-    calls: dict[str, int]
-
-
-def _take_times(contestants: Sequence[Contestant], settings: Settings, tick: Tick) -> tuple[_Rounds, float | None]:
+def _take_times(contestants: Sequence[Contestant], settings: Settings, tick: Tick) -> tuple[Rounds, float | None]:
     """A B C A B C …: seconds per call of every contestant in every round, and the share of the core we had."""
-    warm = {c.name: _seconds(c.call, 1, time.perf_counter) for c in contestants}
-    calls = {name: max(1, math.ceil(SHORTEST / max(t, 1e-7))) for name, t in warm.items()}
-    one_round = sum(calls[name] * t for name, t in warm.items())
-    affordable = int(settings.seconds / max(one_round, 1e-9))
-    number = max(min(settings.repeats, affordable), min(settings.repeats, settings.least_rounds))
-    rounds = _Rounds(number if contestants else 0, {c.name: [] for c in contestants}, calls)
-    if not contestants:
-        return rounds, None
-    clock = _CLOCKS[settings.clock]
-    with _without_garbage_collection():
-        wall, cpu = time.perf_counter(), time.process_time()
-        for r in range(number):
-            for i, c in enumerate(contestants):
-                rounds.seconds[c.name].append(_seconds(c.call, calls[c.name], clock))
-                tick((r + (i + 1) / len(contestants)) / number)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    return rounds, cpu / (wall * settings.threads)
-
-
-def _seconds(call: Callable[[], Any], calls: int, clock: Callable[[], float]) -> float:
-    start = clock()
-    for _ in range(calls):
-        call()
-    return (clock() - start) / calls
-
-
-@contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
+    rounds = take_turns(
+        {c.name: c.call for c in contestants},
+        seconds=settings.seconds,
+        rounds=settings.repeats,
+        least=settings.least_rounds,
+        clock=_CLOCKS[settings.clock],
+        tick=tick,
+    )
+    return rounds, rounds.cores / settings.threads if contestants else None
 
 
 def _figures(ratios: Sequence[Ratio], seconds: Mapping[str, Sequence[float]]) -> Iterator[Figure]:
@@ -267,11 +230,6 @@ def _figures(ratios: Sequence[Ratio], seconds: Mapping[str, Sequence[float]]) ->
                 spread=Spread.of(per_round(seconds[ratio.above], seconds[ratio.below])),
                 bar=ratio.bar,
             )
-
-
-def per_round(above: Sequence[float], below: Sequence[float]) -> list[float]:
-    """t_A(r) / t_B(r) for every round r."""
-    return [a / max(b, 1e-12) for a, b in zip(above, below, strict=True)]
 
 
 @contextmanager

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Self
 
 from pydantic import BaseModel, ConfigDict
+
+from filterlab.costs import Quartiles
 
 SCHEMA = 1
 
@@ -25,10 +27,7 @@ class Spread(Record):
     @classmethod
     def of(cls, values: Sequence[float]) -> Self:
         """Quartiles are interpolated between the sorted values; of a single value all three are that value."""
-        if len(values) == 1:
-            return cls(median=values[0], low=values[0], high=values[0])
-        low, median, high = statistics.quantiles(values, n=4, method="inclusive")
-        return cls(median=median, low=low, high=high)
+        return cls(**asdict(Quartiles.of(values)))
 
 
 class Bar(Record):
@@ -82,7 +81,8 @@ class Timing(Record):
     Attributes:
         name: of the contestant.
         first_call: seconds of its first call: compilation, loading and caches included.
-        seconds: of one call, one number per round; the mean where a round has several calls.
+        seconds: of one call, one number per round; where a round has several calls, their median (see
+            `filterlab.costs.take_turns`).
         spread: of `seconds`.
         calls: calls in a round.
         samples: what one call computes this many of.

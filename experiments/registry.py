@@ -17,7 +17,18 @@ from experiments.report.page import Section
 from experiments.runs import Record, Run, Unit
 from filterlab.io.config import ConfigError, Problem, load_config, unknown_name
 
-_NAMES = ("frequency_response", "rms_error", "dvr_signal", "dvr_volume", "texture_precision", "inverse_dvr", "demo")
+_NAMES = (
+    "frequency_response",
+    "rms_error",
+    "dvr_signal",
+    "dvr_volume",
+    "texture_precision",
+    "inverse_dvr",
+    "speed_accuracy",
+    "equal_error",
+    "stability",
+    "demo",
+)
 
 
 def _nothing_to_check(_config: Any, _path: str = "") -> None:

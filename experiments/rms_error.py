@@ -11,7 +11,7 @@ resolutions. It shows only where the signal is resolved, so a study names the re
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from pydantic import AfterValidator, Field, model_validator
@@ -32,8 +32,10 @@ from experiments.config import (
 from experiments.runs import Record, Run, Unit, timed
 from filterlab import metrics
 from filterlab.io.config import StrictModel
+from filterlab.signals import Signal
 
 CHUNK = 2**14
+STEEP = 0.01  # directions are compared where the gradient is longer than this part of the longest
 
 
 class Study(StrictModel):
@@ -111,28 +113,52 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
 
 def _error(config: Config, study: Study, index: str, n: int, recipe: Recipe, run: Run) -> Record:
     signal = study.signal.build()
-    points, value, gradient = run.memo(f"truth:{index}", lambda: _truth(config, study))
+    truth = run.memo(f"truth:{index}", lambda: _truth(config, study))
     dtype = torch_dtype(config.dtype)
     volume = run.memo(f"volume:{index}/{n}", lambda: signal.sample(n, dtype=dtype, device=config.device))
     field, building = timed(lambda: recipe.reconstruct(volume, config.boundary))
-    (v, g), evaluating = timed(lambda: evaluate(field, points))
+    (v, g), evaluating = timed(lambda: evaluate(field, truth.points))
     return {
         "voxel_size": 1.0 / n,
-        "value_rms": number(metrics.rms(v, value)),
-        "value_max": number(metrics.max_error(v, value)),
-        "gradient_rms": number(metrics.rms(g, gradient, vectors=True)),
-        "gradient_max": number(metrics.max_error(g, gradient, vectors=True)),
+        **truth.errors(v, g),
         "build_seconds": building,
         "evaluate_seconds": evaluating,
         "points": config.points,
     }
 
 
-def _truth(config: Config, study: Study) -> tuple[Tensor, Tensor, Tensor]:
-    """Points `(P, 3)` in the shrunk box of the signal, and its values and gradients there."""
-    signal = study.signal.build()
-    points = uniform_points(signal, config.points, study.inner, config.seed, torch_dtype(config.dtype), config.device)
-    return points, *evaluate(signal, points)
+def _truth(config: Config, study: Study) -> Truth:
+    dtype = torch_dtype(config.dtype)
+    return Truth.of(study.signal.build(), config.points, study.inner, config.seed, dtype, config.device)
+
+
+class Truth(NamedTuple):
+    """A signal at uniform random points of its shrunk box.
+
+    Attributes:
+        points: `(P, 3)`.
+        value: of the signal there, `(P)`.
+        gradient: `(P, 3)`, per world unit.
+    """
+
+    points: Tensor
+    value: Tensor
+    gradient: Tensor
+
+    @classmethod
+    def of(cls, signal: Signal, count: int, inner: float, seed: int, dtype: torch.dtype, device: str) -> Truth:
+        """At `count` points of the box shrunk to `inner`; see `uniform_points`."""
+        points = uniform_points(signal, count, inner, seed, dtype, device)
+        return cls(points, *evaluate(signal, points))
+
+    def errors(self, value: Tensor, gradient: Tensor) -> Record:
+        """RMS and largest errors of values and gradients at these points."""
+        return {
+            "value_rms": number(metrics.rms(value, self.value)),
+            "value_max": number(metrics.max_error(value, self.value)),
+            "gradient_rms": number(metrics.rms(gradient, self.gradient, vectors=True)),
+            "gradient_max": number(metrics.max_error(gradient, self.gradient, vectors=True)),
+        }
 
 
 def uniform_points(field: fl.Field, count: int, inner: float, seed: int, dtype: torch.dtype, device: str) -> Tensor:
@@ -149,6 +175,14 @@ def evaluate(field: fl.Field, points: Tensor) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
         parts = [field.value_and_gradient(chunk) for chunk in points.split(CHUNK)]
     return torch.cat([v for v, _ in parts]), torch.cat([g for _, g in parts])
+
+
+def angles(gradient: Tensor, reference: Tensor) -> Record:
+    """Mean and largest angle between gradients `(P, 3)` in degrees, where the reference has a direction to speak of."""
+    lengths = reference.norm(dim=-1)
+    angle = metrics.angular_error(gradient, reference)[lengths > STEEP * lengths.max()]
+    angle = angle[angle.isfinite()]
+    return {"angle_mean": number(math.degrees(angle.mean())), "angle_max": number(math.degrees(angle.max()))}
 
 
 def _fit(study: Study, index: int, recipe: Recipe, run: Run) -> Record:

@@ -13,7 +13,6 @@ Errors of the value are relative to the range of the samples; errors of the grad
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -33,7 +32,7 @@ from experiments.config import (
     number,
 )
 from experiments.dvr_signal import amplified_difference, image_errors
-from experiments.rms_error import evaluate, uniform_points
+from experiments.rms_error import angles, evaluate, uniform_points
 from experiments.runs import Record, Run, RunError, Unit
 from experiments.views import View
 from filterlab import metrics
@@ -46,7 +45,6 @@ VARIANTS: dict[str, tuple[torch.dtype, str, str]] = {
     "float32 eight samples": (torch.float32, "eight_trilinear", "exact"),
     "float32 8-bit fractions": (torch.float32, "eight_trilinear", "texture_unit"),
 }
-STEEP = 0.01  # directions are compared where the gradient is longer than this part of the longest
 
 
 class Source(StrictModel):
@@ -185,14 +183,10 @@ def _errors(value: Tensor, reference: Tensor, scale: float) -> Record:
 
 
 def _gradient_errors(gradient: Tensor, reference: Tensor, length: float) -> Record:
-    lengths = reference.norm(dim=-1)
-    angle = metrics.angular_error(gradient, reference)[lengths > STEEP * lengths.max()]
-    angle = angle[angle.isfinite()]
     return {
         "gradient_rms": number(metrics.rms(gradient, reference, vectors=True) / length),
         "gradient_max": number(metrics.max_error(gradient, reference, vectors=True) / length),
-        "angle_mean": number(math.degrees(angle.mean())),
-        "angle_max": number(math.degrees(angle.max())),
+        **angles(gradient, reference),
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import torch
 from pydantic import AfterValidator, Field, model_validator
@@ -10,7 +10,6 @@ from torch import Tensor
 
 import filterlab as fl
 from experiments.config import Dtype, torch_dtype
-from experiments.runs import Run
 from filterlab.fields.base import Domain
 from filterlab.io.config import ConfigError, Problem, StrictModel
 from filterlab.render import scene
@@ -33,6 +32,19 @@ def _part(window: list[float]) -> list[float]:
 
 
 Window = Annotated[list[float], Field(min_length=4, max_length=4), AfterValidator(_part)]
+
+
+class Progress(Protocol):
+    """What an image tells how far it is; a `Run` is one."""
+
+    def advance(self, fraction: float) -> None: ...
+
+
+class Silent:
+    """Nobody watches: the image is one of many."""
+
+    def advance(self, fraction: float) -> None:
+        pass
 
 
 class View(StrictModel):
@@ -103,7 +115,7 @@ class View(StrictModel):
         width, height = self.size
         return width * height * voxels / self.step * SECONDS_PER_SAMPLE + 0.2
 
-    def draw(self, field: fl.Field, run: Run, device: str, dtype: Dtype) -> Tensor:
+    def draw(self, field: fl.Field, run: Progress, device: str, dtype: Dtype) -> Tensor:
         """The image of a field over the background, linear RGB `(H, W, 3)`, float32, on the CPU."""
         with torch.no_grad():
             image = render(

@@ -12,7 +12,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from filterlab import kernels, prefilters
+from filterlab import kernels, missing_values, prefilters
 from filterlab.fields.base import Field
 from filterlab.fields.grid import Coefficients, GridField, Scheme, Term, implementation_of
 from filterlab.fields.ncrsi import NCRSI_TERMS, SevenSamples
@@ -247,6 +247,7 @@ def reconstruct(
     gradient: str | None = None,
     sampler: str | Sampler = "exact",
     storage: str | torch.dtype | None = None,
+    nan: str = "refuse",
 ) -> Field:
     """A continuous, differentiable field from a sampled volume: f(x) = Σ_k c_k φ(x − k), c = prefilter(samples).
 
@@ -265,14 +266,17 @@ def reconstruct(
         storage: how coefficients are stored: float64, float32, float16, bfloat16, int16, int8 or uint8 (a torch.dtype
             or its name; integers with a scale and an offset, see `filterlab.fields.storage`). Default: prefiltered
             ones as promote(samples, float32), others as the samples are. Arithmetic does not depend on it.
+        nan: what becomes of voxels that are NaN or infinite: `refuse`, `propagate` (the field is NaN exactly where its
+            kernel reaches one) or `fill` (values from the voxels around); see `filterlab.missing_values`.
 
     Returns:
         a Field. It is differentiable in the volume's samples (any floating dtype; not with integer storage), in points,
         and in the table of a `TensorKernel`.
 
     Raises:
-        ValueError: unknown name, a combination that the method does not offer, a storage that can't hold the
-            coefficients, or a fused scheme that cannot run here (the message says what is missing).
+        ValueError: unknown name, a combination that the method does not offer, voxels that are not finite (with their
+            number), a storage that can't hold the coefficients, or a fused scheme that cannot run here (the message
+            says what is missing).
     """
     if prefilter and isinstance(method, TensorKernel):
         raise ValueError(f"the kernel {method.name} is a TensorKernel and has no prefilter; pass prefilter=False")
@@ -280,13 +284,15 @@ def reconstruct(
         raise TypeError(f"prefilter must be True or False; got {prefilter!r} (from_kernel pairs a kernel with another)")
     volume, method, boundary = as_volume(volume), as_method(method), Boundary.named(boundary)
     chosen, dtype = method.scheme(scheme, gradient, sampler), _storage_for(method, storage)
+    samples, unknown = missing_values.resolved(volume.samples, nan)
     coefficients = Coefficients.of(
-        volume.samples,
+        samples,
         method.prefilter if prefilter else prefilters.IDENTITY,
         boundary,
         chosen.reach,
         method.factor,
         dtype,
+        unknown,
     )
     if isinstance(chosen, Direct) and chosen.name == "fused" and (why := _missing_for_fused(coefficients, chosen)):
         if scheme is not None:

@@ -27,12 +27,13 @@ def resample(
     boundary: str | Boundary = Boundary.MIRROR,
     prefilter: bool = True,
     dtype: torch.dtype | None = None,
+    nan: str = "refuse",
 ) -> Volume:
     """The volume reconstructed by a method and sampled on another grid.
 
     Args:
         volume: a `Volume` or a bare tensor (D, H, W) or (N, C, D, H, W).
-        method, boundary, prefilter: as for `reconstruct`.
+        method, boundary, prefilter, nan: as for `reconstruct`.
         spacing: new voxel edges along x, y, z (world units). The spacing is kept exactly and the new grid is centred on
             the old box of voxels; along an axis of length n·s it has max(1, round(n·s/spacing)) voxels.
         shape: new (D, H, W). The box of voxels is kept exactly, the spacing follows.
@@ -53,7 +54,11 @@ def resample(
         raise ValueError(f"dtype must be a floating type (round and clip the result for {dtype}); got {dtype}")
     working = torch.promote_types(dtype, torch.float32)
     field = reconstruct(
-        volume if volume.dtype == working else volume.to(working), method, boundary=boundary, prefilter=prefilter
+        volume if volume.dtype == working else volume.to(working),
+        method,
+        boundary=boundary,
+        prefilter=prefilter,
+        nan=nan,
     )
     assert isinstance(field, GridField)
     steps = np.linalg.solve(volume.affine, geometry.affine)  # new voxel -> old voxel

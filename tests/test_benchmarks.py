@@ -25,7 +25,7 @@ from benchmarks.records import Figure, Outcome, Report, Section, Spread, Timing,
 from benchmarks.registry import COMPARISONS, UnknownNameError, chosen
 from benchmarks.scene import BRICK, blobs, marschner_lobb
 from benchmarks.settings import Settings
-from filterlab import kernels
+from filterlab import costs, kernels
 
 TINY = Settings(
     repeats=1,
@@ -119,7 +119,7 @@ def test_a_disturbed_round_does_not_count_and_a_slow_machine_cancels(monkeypatch
 
 def test_fast_contestants_are_called_many_times_in_a_turn(monkeypatch):
     clock = Clock(monkeypatch)
-    per_call = harness.SHORTEST / 4
+    per_call = costs.SHORTEST / 4
     race = Race("", [clock.contestant("A", per_call), clock.contestant("B", 10 * per_call)], [Ratio("A", "B")])
     outcome = run_race("x", race, replace(TINY, repeats=2, seconds=100))
     assert [t.calls for t in outcome.timings] == [4, 1]

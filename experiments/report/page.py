@@ -37,11 +37,12 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text cells under columns, with a caption."""
+    """Rows of text cells under columns, with a caption; `wrapped`: cells of words, which break into lines."""
 
     columns: Sequence[Column]
     rows: Sequence[Sequence[str]]
     caption: str
+    wrapped: bool = False
     kind: str = "table"
 
 

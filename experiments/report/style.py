@@ -89,5 +89,25 @@ def fixed(value: float | None, decimals: int = 2) -> str:
     return _minus(f"{round(value, decimals) + 0.0:.{decimals}f}")  # + 0.0: no minus before a zero
 
 
+def times(ratio: float | None) -> str:
+    """A ratio as a factor: 12 ×, 1.08 ×, 0.46 ×, or 1/27 below a third; a dash where there is none."""
+    if ratio is None or not math.isfinite(ratio) or ratio <= 0:
+        return MISSING
+    if ratio < 1 / 3:
+        return f"1/{text(1 / ratio, 2)}"
+    return f"{fixed(ratio) if ratio < 10 else text(ratio)} ×"
+
+
+def memory(size: float | None) -> str:
+    """Bytes in the unit that suits them: 14 KiB, 2.5 MiB."""
+    if size is None:
+        return MISSING
+    power = min(max(int(math.log2(max(size, 1)) // 10), 0), 3)
+    return f"{text(size / 2 ** (10 * power), 2 if size < 2 ** (10 * power) * 100 else 3)} {_UNITS[power]}"
+
+
+_UNITS = ("B", "KiB", "MiB", "GiB")
+
+
 def _minus(plain: str) -> str:
     return plain.replace("-", "−")

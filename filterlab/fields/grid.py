@@ -91,8 +91,11 @@ class Coefficients:
         reach: int,
         factor: Factor | None = None,
         storage: torch.dtype | None = None,
+        unknown: Tensor | None = None,
     ) -> Coefficients:
         """Prefilter, extend by the boundary, apply the discrete part of a factored kernel, and store.
+
+        Where `unknown`, a mask of the samples, coefficients are NaN: after the prefilter, which would spread them.
 
         Memory: (n + 2·pad)³ coefficients, pad = reach (+1 for a factored kernel) under mirror, reflect and wrap;
         under border and zeros 2·reach plus the prefilter's decay (about 10 … 50 voxels, see `Prefilter.decay`).
@@ -108,6 +111,8 @@ class Coefficients:
         if prefilter.is_identity or not boundary.periodic:
             for dim in (-3, -2, -1):
                 values = boundary.extend(values, dim, pad, pad)
+        if unknown is not None:
+            values = values.masked_fill(_extended(unknown, boundary, pad + decay), torch.nan)
         shift = 0.0
         if factor is not None:
             values, shift = _apply_factor(values, factor), 0.5
@@ -128,6 +133,12 @@ class Coefficients:
     def placement(self, geometry: Geometry) -> Placement:
         """How world points become coordinates of these coefficients."""
         return Placement(geometry, self.boundary, self.size, self.tail, self.shift)
+
+
+def _extended(mask: Tensor, boundary: Boundary, reach: int) -> Tensor:
+    for dim in (-3, -2, -1):
+        mask = boundary.extend(mask, dim, reach, reach)
+    return mask
 
 
 def implementation_of(scheme: str, device: torch.device) -> str:

@@ -103,7 +103,11 @@ def loads_config(
 
 def dump_config(config: BaseModel) -> str:
     """A YAML text that `load_config` reads back to an equal model. Raises ValueError on numbers that are not finite."""
-    data = config.model_dump(mode="json")
+    return dump_data(config.model_dump(mode="json"))
+
+
+def dump_data(data: Any) -> str:
+    """The same of plain data: mappings, lists, texts, numbers."""
     _check_finite(data, ())
     readable = not re.search("[\x85\u2028\u2029\ufeff]", json.dumps(data, ensure_ascii=False))  # PyYAML folds these
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=readable, width=120)

@@ -186,6 +186,7 @@ class Reconstruction(StrictModel):
     gradient: str | None = None
     sampler: Literal["exact", "texture_unit"] = "exact"
     storage: Literal["float64", "float32", "float16", "bfloat16", "int16", "int8", "uint8"] | None = None
+    nan: Literal["refuse", "propagate", "fill"] = "refuse"
 
     @model_validator(mode="before")
     @classmethod
@@ -208,6 +209,7 @@ class Reconstruction(StrictModel):
             gradient=self.gradient,
             sampler=self.sampler,
             storage=self.storage,
+            nan=self.nan,
         )
 
 

@@ -265,7 +265,7 @@ def test_rays_along_axes_and_edges_of_bricks(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_hidden_nan_is_still_found() -> None:
     volume = ball()
     volume[2, 2, 2] = torch.nan
-    field = reconstruct(volume, "trilinear", scheme="fused")
+    field = reconstruct(volume, "trilinear", scheme="fused", nan="propagate")
     camera = PerspectiveCamera.framing(field.domain, (0.4, 0.8, -0.45))
     image = render(field, camera, PEAK, size=(40, 40), dtype=torch.float64)
     assert 0 < image.isnan().any(-1).sum() < 100

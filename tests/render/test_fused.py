@@ -182,7 +182,7 @@ def test_rays_along_axes_on_faces_from_inside_and_missing() -> None:
 def test_a_voxel_of_nan_shows_in_the_same_pixels() -> None:
     values = samples()
     values[4, 6, 5] = torch.nan
-    images = both(turned(values), method="catmull-rom", shading=LIT, size=(20, 18))
+    images = both(turned(values), method="catmull-rom", field={"nan": "propagate"}, shading=LIT, size=(20, 18))
     assert_same(images)
     assert 0 < images[0].isnan().any(-1).sum() < 180
 
@@ -191,10 +191,12 @@ def test_nothing_behind_the_end_of_a_ray_is_seen() -> None:
     """A pack goes on behind the region, where the volume is NaN."""
     values = samples(torch.float64, (12, 12, 12))
     values[:, 7:] = torch.nan
-    camera = OrthographicCamera.framing(reconstruct(values).domain, (0, 1, 0))
+    kept = {"nan": "propagate"}
+    camera = OrthographicCamera.framing(reconstruct(values, **kept).domain, (0, 1, 0))
     for stop in torch.linspace(3.2, 5.9, 9).tolist():
         region = ((-9.0, -9.0, -9.0), (20.0, stop, 20.0))
-        image, expected = both(values, camera, method="trilinear", region=region, shading=LIT, dtype=torch.float64)
+        scene = {"region": region, "shading": LIT, "dtype": torch.float64}
+        image, expected = both(values, camera, method="trilinear", field=kept, **scene)
         assert image.isfinite().all()
         assert_same((image, expected))
 

@@ -1,0 +1,261 @@
+"""Points: NaN, infinite, huge, at the ends and the knots, far from the origin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import filterlab as fl
+from experiments.extremes.contract import Case, Finding, Subject, Tally
+from filterlab.fields.grid import GridField
+
+SIZE = (6, 7, 9)  # D, H, W of the volumes
+SWEEP = ("method", "scheme", "boundary", "device")
+
+
+@lru_cache(maxsize=512)
+def samples_on(device: str) -> Tensor:
+    values = torch.rand(SIZE, generator=torch.Generator().manual_seed(11), dtype=torch.float64)
+    return (2 * values - 1).to(torch.float32).to(device)
+
+
+def field_of(subject: Subject, samples: Tensor | fl.Volume | None = None, **options: str) -> GridField:
+    """The subject's field of a small volume of numbers between −1 and 1; with the gradient that its scheme gives."""
+    samples = samples_on(subject.device) if samples is None else samples
+    found = fl.reconstruct(
+        samples,
+        subject.method,
+        boundary=subject.boundary,
+        scheme=subject.scheme,
+        gradient=fl.METHODS[subject.method].sampled_gradient if subject.scheme == "eight_trilinear" else None,
+        storage=options.get("storage"),
+        nan=options.get("nan", "refuse"),
+    )
+    assert isinstance(found, GridField)
+    return found
+
+
+def refusal(call: Callable[[], object]) -> str:
+    """The message of the ValueError that a call raises."""
+    try:
+        call()
+    except ValueError as error:
+        return str(error)
+    return "was accepted"
+
+
+def points_inside(random: np.random.Generator, count: int, device: str, beyond: float = 4.0) -> Tensor:
+    """World points `(count, 3)`, float32, in the volume and up to `beyond` voxels around it."""
+    size = np.array(SIZE[::-1])
+    points = random.uniform(-beyond, size - 1 + beyond, (count, 3))
+    return torch.tensor(points, dtype=torch.float32, device=device)
+
+
+def nan_coordinate(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """Replace one coordinate of some points by NaN; compare with the points left as they were."""
+    tally, field = Tally(), field_of(subject)
+    count = max(int(2000 * amount), 50)
+    points = points_inside(random, count, subject.device)
+    hit = torch.tensor(random.random(count) < 0.2, device=subject.device)
+    poisoned = points.clone()
+    axes = torch.tensor(random.integers(0, 3, count), device=subject.device)
+    poisoned[hit, axes[hit]] = math.nan
+    before, after = field.jet(points, 1), field.jet(poisoned, 1)
+    for name, a, b in zip(("value", "gradient"), before, after, strict=True):
+        tally.kept(bool(b[hit].isnan().all()), f"{name} of a NaN point is not NaN", int(hit.sum()))
+        tally.kept(torch.equal(a[~hit], b[~hit]), f"{name} of another point changed", int((~hit).sum()))
+    _nan_gradients(subject, poisoned, hit, axes, tally)
+    return tally.finding()
+
+
+def _nan_gradients(subject: Subject, points: Tensor, hit: Tensor, axes: Tensor, tally: Tally) -> None:
+    """NaN to the coordinates of points that have one, nothing to the volume."""
+    grads = []
+    for chosen in (points, points[~hit]):
+        samples = samples_on(subject.device).clone().requires_grad_()
+        leaf = chosen.clone().requires_grad_()
+        field_of(subject, samples)(leaf).sum().backward()
+        assert samples.grad is not None
+        assert leaf.grad is not None
+        grads.append((samples.grad, leaf.grad))
+    (by_samples, by_points), (by_samples_rest, by_points_rest) = grads
+    close = torch.allclose(by_samples, by_samples_rest, rtol=1e-4, atol=1e-4)
+    tally.kept(close, "a NaN point gave the volume a derivative")
+    tally.kept(bool(by_points[hit].gather(1, axes[hit, None]).isnan().all()), "a NaN coordinate got a derivative")
+    tally.kept(torch.equal(by_points[~hit], by_points_rest), "derivatives by other points changed")
+
+
+# --- infinite and huge -----------------------------------------------------------------------------------------------
+
+
+def infinite_coordinate(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """One, two or three coordinates of points become ±inf."""
+    tally, field = Tally(1e-5), field_of(subject)
+    count = max(int(1000 * amount), 50)
+    points = points_inside(random, count, subject.device)
+    hit = random.random((count, 3)) < 0.4
+    hit[:, 0] |= ~hit.any(1)
+    signs = np.where(random.random((count, 3)) < 0.5, -1.0, 1.0)
+    infinite, hit = torch.tensor(signs * math.inf, device=subject.device), torch.tensor(hit, device=subject.device)
+    value, gradient = field.jet(torch.where(hit, infinite.float(), points), 1)
+    if field.coefficients.boundary.periodic:
+        tally.kept(bool(value.isnan().all() and gradient.isnan().all()), "not NaN at infinity", count)
+        return tally.finding()
+    # where the extension is constant: far outside, at a coordinate that float32 has without rounding
+    far = torch.where(hit, (1000 * infinite.sign()).float(), points)
+    for found, expected in zip((value, gradient), field.jet(far, 1), strict=True):
+        tally.error(largest(found - expected), "another value than far outside", count)
+    if subject.boundary == "zeros":
+        tally.error(largest(value), "not 0 at infinity")
+    else:
+        tally.error(largest(field(infinite.float()[:8]) - _corner_values(field, infinite[:8])), "not a corner's value")
+    return tally.finding()
+
+
+def _corner_values(field: GridField, directions: Tensor) -> Tensor:
+    """The value at the corner voxel of each direction `(P, 3)`, of an interpolating method; else far outside."""
+    size = directions.new_tensor(SIZE[::-1])
+    if not fl.METHODS[field.method].facts.interpolating:
+        return field((1000 * directions.sign()).float())
+    return field(torch.where(directions > 0, size - 1, 0 * size).float())
+
+
+def huge_coordinate(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """Coordinates from 2²⁴ to 3·10³⁸ voxels, where float32 has integers only: folded as integers of Python are."""
+    tally, field = Tally(2e-5), field_of(subject)
+    count = max(int(500 * amount), 50)
+    exponents = random.uniform(24, 127.99, (count, 3))
+    huge = np.float32(np.where(random.random((count, 3)) < 0.5, -1, 1) * 2.0**exponents)
+    some = random.random((count, 3)) < 0.5
+    inside = points_inside(random, count, subject.device, beyond=0.0).cpu().numpy()
+    points = np.where(some, huge, inside).astype(np.float32)
+    folded, signs = np.empty((count, 3)), np.empty((count, 3))
+    for index in np.ndindex(count, 3):
+        folded[index], signs[index] = _folded(float(points[index]), SIZE[2 - index[1]], subject.boundary)
+    value, gradient = field.jet(torch.tensor(points, device=subject.device), 1)
+    expected, slope = field.jet(torch.tensor(folded, dtype=torch.float32, device=subject.device), 1)
+    tally.error(largest(value - expected), "a value that its folded point does not have", count)
+    # on a plane of reflection the sign is one of two
+    off = (gradient.abs() - (slope * torch.tensor(signs, device=subject.device).float()).abs()).abs()
+    tally.error(largest(off), "a gradient that its folded point does not have", count)
+    return tally.finding()
+
+
+def _folded(x: float, n: int, boundary: str) -> tuple[float, float]:
+    """The coordinate within one period, or far outside, and the derivative by x; exact for integers."""
+    if boundary in ("border", "zeros"):
+        return (max(min(x, 1000.0), -1000.0), 0.0 if abs(x) >= 1000 else 1.0)
+    period = {"mirror": 2 * n - 2, "reflect": 2 * n, "wrap": n}[boundary]
+    if x != int(x):
+        return x, 1.0
+    k = int(x) % period
+    if boundary == "wrap" or k < n:
+        return float(k), 1.0
+    return float((period if boundary == "mirror" else period - 1) - k), -1.0
+
+
+# --- the ends and the knots ------------------------------------------------------------------------------------------
+
+
+def ends_and_knots(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """A step of one unit of rounding across ends, knots and half-knots: value and gradient go on as the class says."""
+    tally, field = Tally(1e-4), field_of(subject)
+    facts = fl.METHODS[subject.method].facts
+    count = max(int(800 * amount), 50)
+    size = np.array(SIZE[::-1])
+    places = random.integers(-6, 2 * size + 6, (count, 3)) / 2.0  # knots and half-knots, outside too
+    ends = np.where(random.random((count, 3)) < 0.5, 0.0, size - 1.0)
+    places = np.where(random.random((count, 3)) < 0.3, ends, places).astype(np.float32)
+    axis = random.integers(0, 3, count)
+    before, after = places.copy(), places.copy()
+    rows = np.arange(count)
+    before[rows, axis] = np.nextafter(places[rows, axis], np.float32(-np.inf))
+    after[rows, axis] = np.nextafter(places[rows, axis], np.float32(np.inf))
+    jets = [field.jet(torch.tensor(p, device=subject.device), 1) for p in (before, places, after)]
+    smooth = facts.continuity >= 1 or field.scheme.gradient == "central"
+    for order in range(2 if smooth else 1):
+        for one, other in ((0, 1), (1, 2)):
+            tally.error(largest(jets[one][order] - jets[other][order]), f"a jump of derivative {order}", count)
+    zero = places.copy()
+    zero[zero == 0] = -0.0
+    same = all(
+        torch.equal(a, b) for a, b in zip(jets[1], field.jet(torch.tensor(zero, device=subject.device), 1), strict=True)
+    )
+    tally.kept(same, "−0.0 is not 0.0", count)
+    return tally.finding()
+
+
+# --- far from the origin ---------------------------------------------------------------------------------------------
+
+ORIGIN = (1e6, -1e6, 2e6)
+
+
+def far_from_the_origin(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """The volume stands millions of voxels away; its points are given in float64, and in float32 for comparison."""
+    tally = Tally(1e-5)
+    samples = samples_on(subject.device)
+    near, far = field_of(subject), field_of(subject, fl.Volume(samples, origin=ORIGIN))
+    count = max(int(2000 * amount), 50)
+    points = points_inside(random, count, subject.device).double()
+    moved = points + points.new_tensor(ORIGIN)
+    lost = 0.0
+    for exact, kept, rough in zip(near.jet(points, 1), far.jet(moved, 1), far.jet(moved.float(), 1), strict=True):
+        tally.error(largest(exact - kept), "digits were lost with float64 points", count)
+        lost = max(lost, largest(exact - rough))
+    found = tally.finding()
+    return replace(found, note=found.note or f"with float32 points the error is {lost:.2g}")
+
+
+def largest(x: Tensor) -> float:
+    return float(x.detach().abs().max())
+
+
+CASES = (
+    Case(
+        "nan-coordinate",
+        "NaN coordinate",
+        "NaN in that output only; no derivative to the volume, NaN to that coordinate; no bit of any other output "
+        "changes.",
+        nan_coordinate,
+        SWEEP,
+        0.05,
+    ),
+    Case(
+        "infinite-coordinate",
+        "±inf coordinate",
+        "border: the edge value; zeros: 0; mirror, reflect and wrap: NaN in that output.",
+        infinite_coordinate,
+        SWEEP,
+        0.05,
+    ),
+    Case(
+        "huge-coordinate",
+        "coordinates of 2²⁴ … 3·10³⁸ voxels",
+        "Folded as exactly as small ones; border: the edge value; zeros: 0.",
+        huge_coordinate,
+        SWEEP,
+        0.05,
+    ),
+    Case(
+        "ends-and-knots",
+        "0, −0.0, n−1, knots and half-knots, from both sides",
+        "The value is continuous, the gradient too where the method is C¹ (or takes central differences).",
+        ends_and_knots,
+        SWEEP,
+        0.05,
+    ),
+    Case(
+        "far-from-the-origin",
+        "a volume 10⁶ voxels from the origin",
+        "Float64 points keep 10⁻⁵ of the range in value and gradient; float32 points have lost their digits already.",
+        far_from_the_origin,
+        SWEEP,
+        0.05,
+    ),
+)

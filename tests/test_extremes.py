@@ -1,0 +1,71 @@
+"""The contract at the extremes: the cases of `experiments.extremes`, shorter, and what holds them together."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from experiments.extremes import CASES
+from experiments.extremes.contract import Case, Finding, Subject, Tally, random_numbers
+
+AMOUNT = 0.1
+BY_CASE = [(case, subject) for case in CASES.values() for subject in case.subjects()]
+
+
+@pytest.mark.parametrize(("case", "subject"), BY_CASE, ids=[f"{case.key}-{subject.key}" for case, subject in BY_CASE])
+def test_the_contract_is_kept(case: Case, subject: Subject) -> None:
+    finding = case.run(subject, seed=2, amount=AMOUNT)
+    if finding.skipped:
+        pytest.skip(finding.skipped)
+    assert finding.holds, finding
+
+
+def test_a_finding_needs_inputs_and_an_error_within_the_bound() -> None:
+    assert Finding(3, 0.5, 1.0).holds
+    assert not Finding(3, 1.5, 1.0).holds
+    assert not Finding(3, math.nan, 1.0).holds
+    assert not Finding(0, 0.0, 1.0).holds
+    assert not Finding(3, 0.0, 1.0, skipped="no GPU").holds
+
+
+def test_a_tally_keeps_the_worst() -> None:
+    tally = Tally(bound=1.0)
+    for size in (0.5, 2.0, 0.25):
+        tally.error(size, f"size {size}")
+    assert tally.finding() == Finding(3, 2.0, 1.0, "size 2.0")
+    tally = Tally(bound=1.0)
+    tally.error(math.nan, "a NaN")
+    assert not tally.finding().holds
+    tally = Tally()
+    tally.kept(True, "good", 5)
+    assert tally.finding() == Finding(5, 0.0, 0.0)
+    tally.kept(False, "bad", 2)
+    assert tally.finding() == Finding(7, 1.0, 0.0, "bad")
+    tally = Tally(bound=1e-3)
+    tally.kept(False, "bad")
+    assert not tally.finding().holds
+
+
+def test_an_error_that_nobody_expects_breaks_the_contract() -> None:
+    def check(subject, random, amount):
+        raise IndexError("7 is out of range")
+
+    finding = Case("boom", "", "", check).run(Subject(), 0)
+    assert not finding.holds
+    assert finding.note == "IndexError: 7 is out of range"
+
+
+def test_cases_draw_their_own_numbers() -> None:
+    same = [random_numbers("a", Subject("notch"), 1).random() for _ in range(2)]
+    others = [random_numbers("b", Subject("notch"), 1).random(), random_numbers("a", Subject("ncrsi"), 1).random()]
+    assert same[0] == same[1]
+    assert len({same[0], *others}) == 3
+
+
+def test_a_sweep_leaves_out_what_a_method_does_not_offer() -> None:
+    case = Case("x", "", "", lambda *_: Finding(1, 0, 0), ("method", "scheme"))
+    found = case.subjects(["mitchell", "notch"])
+    assert Subject("mitchell", "eight_trilinear") not in found
+    assert Subject("notch", "eight_trilinear") in found
+    assert Case("y", "", "", lambda *_: Finding(1, 0, 0)).subjects() == [Subject()]
