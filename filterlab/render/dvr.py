@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import SupportsFloat
+from typing import SupportsFloat, SupportsIndex
 
 import torch
 from torch import Tensor
@@ -29,12 +29,13 @@ from filterlab.render.fused import FusedMarcher, can_be_fused
 from filterlab.render.plain import Chords, Marcher, Medium, PlainMarcher, rays_at_once
 from filterlab.render.rays import Region, check_rays, check_region, intersect, jitter, segment_count
 from filterlab.render.shading import Shading
-from filterlab.render.transfer import TransferFunction
+from filterlab.render.transfer import TransferFunction, absorbed
 
 Rays = tuple[Tensor, Tensor]
 Progress = bool | None | Callable[[int, int], None]
 
 _TILE = 1 << 16  # rays that are cut at a time; more would only leave the caches
+_MOST_SEGMENTS = 2.0**62  # of a ray, that can be counted; no limit on the number of samples is as high
 _BYTES_PER_RAY = 256
 _BYTES_PER_RAY_SAVED = 2048  # of the fused marcher while autograd records
 
@@ -125,9 +126,10 @@ def render(
     brightest = max(brightest, float(color.detach().max()), 1.0)
     transfer = transfer.to(dtype, device)
     faint = 0.0 if termination is None or differentiable else termination / brightest
-    length = step * field.domain.voxel_size
+    asked = float(step) * field.domain.voxel_size
+    length = min(asked, 2 * field.domain.diagonal)  # beyond every end there is nothing to cut, only digits to lose
     media = [Medium(one, transfer, shading, length, faint, differentiable) for one in _unbatched(field)]
-    cut = _Cut(field.domain, box, length, jitter_seed, differentiable)
+    cut = _Cut(field.domain, box, length, asked / length, jitter_seed, differentiable)
     marcher, tile = _marcher(media[0], memory)
     with torch.set_grad_enabled(differentiable):
         parts: Sequence[Tensor | Chords] = view.pixels.split(tile)
@@ -205,11 +207,15 @@ class _View:
 
 @dataclass(frozen=True)
 class _Cut:
-    """Cuts rays to a field's domain and into segments; all lengths are world lengths."""
+    """Cuts rays to a field's domain and into segments; all lengths are world lengths.
+
+    The step that was asked for is `stretch` times `step`: more than 1 only where that is longer than any ray inside.
+    """
 
     domain: Domain
     region: Region | None
     step: float
+    stretch: float
     jitter_seed: int | None
     differentiable: bool
 
@@ -220,9 +226,8 @@ class _Cut:
         else:
             entry, direction, length = self.inside(view, pixels)
         offset = self.offset(pixels)
-        return Chords(
-            entry, direction, length, offset, segment_count(length, self.step, offset).clamp_max(2.0**62).long()
-        )
+        count = segment_count(length, self.step, offset).clamp_max(_MOST_SEGMENTS).long()
+        return Chords(entry, direction, length, offset, count)
 
     def inside(self, view: _View, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Where rays enter the domain `(R, 3)`, their directions and lengths inside `(R,)`."""
@@ -237,7 +242,7 @@ class _Cut:
         """How far into a step the first segment reaches, `(R,)`, in (0, 1]."""
         if self.jitter_seed is None:
             return torch.ones_like(pixels, dtype=torch.float64)
-        return jitter(self.jitter_seed, pixels)
+        return (self.stretch * jitter(self.jitter_seed, pixels)).clamp_max(1)
 
     @torch.no_grad()
     def count_all(self, view: _View, parts: Sequence[Tensor | Chords], images: int, limit: int) -> int:
@@ -250,8 +255,9 @@ class _Cut:
                 total += float(segment_count(self.inside(view, part)[2], self.step, self.offset(part)).sum())
         total *= images
         if not total <= limit:
+            more = "more than " if total >= _MOST_SEGMENTS else ""
             raise ValueError(
-                f"the image would take {total:.3g} samples; the limit is max_samples={limit:.3g}: "
+                f"the image would take {more}{total:.3g} samples; the limit is max_samples={limit:.3g}: "
                 "use a longer step, a smaller image or region, or raise max_samples"
             )
         return int(total)
@@ -260,7 +266,7 @@ class _Cut:
 def _over(light: Tensor, depth: Tensor, background: Tensor) -> Tensor:
     """Emitted light `(R, 3)` of rays of optical depth `(R, 1)` over a background `(3,)`: RGB and opacity `(R, 4)`."""
     rgb = light + torch.exp(-depth) * background
-    return torch.cat((rgb, -torch.expm1(-depth)), -1).to(background.dtype)
+    return torch.cat((rgb, absorbed(depth)), -1).to(background.dtype)
 
 
 def _check_arguments(
@@ -287,15 +293,24 @@ def _check_arguments(
         raise TypeError(f"transfer must be a TransferFunction; got {type(transfer).__name__}")
     if not isinstance(shading, Shading | None):
         raise TypeError(f"shading must be a Shading, or None for unlit; got {type(shading).__name__}")
-    if not isinstance(step, SupportsFloat) or not 0 < step < math.inf:
+    if not 0 < _number(step) < math.inf:
         raise ValueError(f"step must be a positive number of voxels; got {step!r}")
-    if termination is not None and (not isinstance(termination, SupportsFloat) or not 0 < termination < 1):
+    if termination is not None and not 0 < _number(termination) < 1:
         raise ValueError(f"termination must be a transmittance between 0 and 1, or None; got {termination!r}")
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64; got {dtype}")
-    for name, value in (("max_samples", max_samples), ("memory", memory)):
-        if not value > 0:
-            raise ValueError(f"{name} must be positive; got {value}")
+    if not _number(max_samples) > 0:
+        raise ValueError(f"max_samples must be a positive number; got {max_samples!r}")
+    if not isinstance(memory, SupportsIndex) or memory <= 0:
+        raise ValueError(f"memory must be a positive whole number of bytes; got {memory!r}")
+
+
+def _number(value: object) -> float:
+    """The value as one number; NaN where it is none."""
+    try:
+        return float(value) if isinstance(value, SupportsFloat) else math.nan
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):  # a tensor of several, an integer beyond all floats
+        return math.nan
 
 
 def _check_background(background: Sequence[float] | Tensor, dtype: torch.dtype, device: torch.device) -> Tensor:

@@ -21,7 +21,7 @@ from torch.utils.checkpoint import checkpoint
 from filterlab.fields.base import Field
 from filterlab.render.rays import segments
 from filterlab.render.shading import Shading
-from filterlab.render.transfer import TransferFunction
+from filterlab.render.transfer import TransferFunction, absorbed
 
 Report = Callable[[int], None]
 """Is told how many samples of the current tile are done."""
@@ -183,7 +183,7 @@ def _compose(tau: Tensor, depth: Tensor, faint: float) -> tuple[Tensor, Tensor]:
     sums = tau.cumsum(-1)
     before = torch.cat((torch.zeros_like(sums[:, :1]), sums[:, :-1]), -1) + depth.to(tau.dtype)[:, None]  # never ∞ − ∞
     transmittance = torch.exp(-before)
-    weight = transmittance * -torch.expm1(-tau)
+    weight = transmittance * absorbed(tau)
     if faint > 0:
         weight = torch.where(transmittance < faint, torch.zeros_like(weight), weight)
     return weight, depth + sums[:, -1].double()
