@@ -453,6 +453,11 @@ def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]
 
 def _message(error: ValueError | OSError) -> str:
     """The text of an error; for the operating system's own, what it says about which file."""
+    from filterlab.io.atomic import disk_is_full
+
+    if disk_is_full(error):
+        where = f"cannot write {error.filename}: " if error.filename else ""  # type: ignore[union-attr]
+        return f"{where}the disk is full ({error.strerror})"  # type: ignore[union-attr]
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or ''}: {error.strerror}".removeprefix(": ")
     return str(error)
