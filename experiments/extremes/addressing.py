@@ -24,6 +24,8 @@ PIECE = 12
 
 def huge_volumes(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
     """Sums over taps at the far end of a volume of 2.4·10⁹ bytes, most of which were never written."""
+    if subject.scheme == "eight_trilinear":
+        return Finding(0, 0.0, 0.0, skipped="its samples are sums of the scheme direct")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "volume"
         try:
