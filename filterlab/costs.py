@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from random import Random
 from typing import Any
 
 import torch
@@ -32,6 +33,7 @@ SHORTEST = (
 BATCHES = 9  # of calls in a turn, at most
 ROUNDS = 31  # at most, where the time allows
 LEAST_ROUNDS = 3
+SPACER = 2**22  # bytes, at most
 
 
 @dataclass(frozen=True)
@@ -122,8 +124,8 @@ def measure(
             others; it adds up all threads.
         tick: told which fraction is done.
 
-    Fields are built anew in every round: where their memory happens to lie would else decide all rounds alike (seen:
-    a factor of three). One is kept while the next is built; memory is that of two.
+    Fields are built anew in every round, and in another place in memory: where it happens to lie would else decide all
+    rounds alike (seen: a factor of three). One is kept while the next is built; memory is that of two.
 
     Returns:
         name -> `Cost`, in the order of the candidates.
@@ -135,11 +137,13 @@ def measure(
     for name, p in where.items():
         if p.numel() == 0:
             raise ValueError(f"expected points (P, 3) with P ≥ 1 to sample {name} at; got shape {tuple(p.shape)}")
-    held: list[Field] = []  # the field that was built last: each is sampled before the next one is built
+    held: list[Any] = []  # the field that was built last (each is sampled before the next one is built), and a spacer
+    random = Random(0)
 
     def built(name: str) -> Field:
+        spacer = torch.empty(random.randrange(SPACER), dtype=torch.uint8)  # so that the field lies elsewhere
         field = candidates[name]()
-        held[:] = [field]
+        held[:] = [field, spacer]
         return field
 
     def sampled(name: str) -> tuple[Tensor, ...]:
