@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import shlex
 import sys
 import time
@@ -21,6 +20,7 @@ from experiments.registry import Experiment, experiment_of, load
 from experiments.report.write import write_report
 from experiments.runs import Record, Run, RunError, Unit, provenance, run_folder
 from filterlab.io import VolumeFileError
+from filterlab.io.atomic import disk_is_full
 from filterlab.io.config import ConfigError
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
@@ -281,9 +281,10 @@ def _report(folder: Path) -> int:
 
 
 def _explained(error: Exception) -> str:
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+    if isinstance(error, OSError) and disk_is_full(error):
         kept = "what was finished is kept: free some space and give the same command again"
-        return f"the disk is full ({error.strerror}); {kept}"
+        where = f" at {error.filename}" if error.filename else ""
+        return f"the disk is full{where} ({error.strerror}); {kept}"
     return str(error)
 
 

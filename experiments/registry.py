@@ -26,6 +26,8 @@ _NAMES = (
     "inverse_dvr",
     "speed_accuracy",
     "equal_error",
+    "fit_kernel",
+    "recommend_validation",
     "stability",
     "demo",
 )

@@ -10,12 +10,12 @@ runs/<config name>-<hash of the resolved config and of the input files>[-2, -3, 
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
 import platform
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -31,12 +31,15 @@ from pydantic import BaseModel
 from torch import Tensor
 
 from filterlab.io import load_image, save_image
-from filterlab.io.atomic import atomic_write
+from filterlab.io.atomic import atomic_write, remove_temporaries
 from filterlab.io.config import dump_config
+from filterlab.io.numpy_files import write_array
 
 Record = dict[str, Any]
 T = TypeVar("T")
 CODE = ("filterlab", "commit")  # of a start: by which code its records were computed
+_APPENDING = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
+_WRITTEN_WITHIN = 60.0  # seconds: a report that another process is writing just now is not taken from it
 
 
 class RunError(ValueError):
@@ -125,6 +128,8 @@ class Run:
             raise RunError(f"expected a run folder that can be written; {folder}: {error.strerror}") from None
         with lock:
             _lock(lock, folder)
+            remove_temporaries(folder, older=_WRITTEN_WITHIN)
+            remove_temporaries(folder / "files")
             _write_config(folder, config)
             starts = _begin(folder, provenance)
             yield cls(folder, repaired_records(folder), shared=_Shared(starts))
@@ -145,7 +150,7 @@ class Run:
     def done(self, key: str) -> bool:
         """True when the unit is recorded and every file that the record names is there."""
         record = self._records.get(self.prefix + key)
-        return record is not None and all((self.folder / f).is_file() for f in record.get("files", []))
+        return record is not None and all(run_file(self.folder, f).is_file() for f in record.get("files", []))
 
     @property
     def start(self) -> Record:
@@ -163,7 +168,7 @@ class Run:
     def append(self, key: str, record: Mapping[str, Any]) -> Record:
         """Writes the record of a finished unit, with the number of this start; then it is on the disk."""
         full = {"key": self.prefix + key, "start": self.start["start"], **record}
-        descriptor = os.open(self.folder / "records.jsonl", os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        descriptor = os.open(self.folder / "records.jsonl", _APPENDING, 0o644)
         try:
             _append_line(descriptor, full)
         finally:
@@ -181,16 +186,16 @@ class Run:
         """Saves numbers as .npy under a temporary name, renames it, and returns its name for the record."""
         path = self._file(f"{name}.npy")
         with atomic_write(path) as temporary, temporary.open("wb") as file:
-            np.save(file, array.detach().cpu().numpy(), allow_pickle=False)
+            write_array(file, array.detach().cpu().numpy())
         return str(path.relative_to(self.folder))
 
     def load_array(self, name: str) -> Tensor:
         """An array that a record names."""
-        return torch.from_numpy(np.load(self.folder / name, allow_pickle=False))
+        return torch.from_numpy(np.load(run_file(self.folder, name), allow_pickle=False))
 
     def load_image(self, name: str) -> Tensor:
         """An image that a record names."""
-        return load_image(self.folder / name)
+        return load_image(run_file(self.folder, name))
 
     def memo(self, key: str, make: Callable[[], T]) -> T:
         """`make()`, kept in memory until `memo` of the same kind (the key up to its first colon) is asked for anew."""
@@ -211,7 +216,7 @@ class Run:
         self._shared.on_advance = callback
 
     def _file(self, name: str) -> Path:
-        path = self.folder / "files" / (self.prefix + name).replace("/", "--")
+        path = run_file(self.folder, "files/" + (self.prefix + name).replace("/", "--"))
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
@@ -225,10 +230,30 @@ class _Shared:
     on_advance: Callable[[float], None] = lambda _fraction: None
 
 
+def run_file(folder: Path, name: str) -> Path:
+    """The file of a run folder by the name that a record has for it.
+
+    Raises:
+        RunError: a name that leads out of the folder; no record of ours has one.
+    """
+    path = Path(name)
+    if path.is_absolute() or path.drive or ".." in path.parts or "\0" in name:
+        raise RunError(f"expected the name of a file in {folder}; got {name!r}, which is none")
+    return folder / path
+
+
 def _lock(lock: Any, folder: Path) -> None:
+    """Held until the file is closed, which the operating system does even for a process that is killed."""
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(lock.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
         advice = "wait for it, or use --fresh for a folder of your own"
         raise RunError(f"{folder} is in use by another process; {advice}") from None
 
@@ -236,11 +261,11 @@ def _lock(lock: Any, folder: Path) -> None:
 def _write_config(folder: Path, config: BaseModel) -> None:
     path, text = folder / "config.yaml", dump_config(config)
     if path.exists():
-        if path.read_text() != text:
+        if path.read_text(encoding="utf-8") != text:
             raise RunError(f"{path} holds another config than the one asked for; use --fresh for a new folder")
         return
     with atomic_write(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _begin(folder: Path, provenance: Mapping[str, Any]) -> list[Record]:
@@ -259,10 +284,16 @@ def _begin(folder: Path, provenance: Mapping[str, Any]) -> list[Record]:
 
 
 def _append_line(descriptor: int, record: Mapping[str, Any]) -> None:
+    """The whole line or, on a full disk, nothing of it."""
     line = (json.dumps(record, ensure_ascii=False, allow_nan=False) + "\n").encode()
-    while line:
-        line = line[os.write(descriptor, line) :]
-    os.fsync(descriptor)
+    before = os.fstat(descriptor).st_size
+    try:
+        while line:
+            line = line[os.write(descriptor, line) :]
+        os.fsync(descriptor)
+    except OSError:
+        os.ftruncate(descriptor, before)
+        raise
 
 
 def read_records(folder: Path) -> tuple[dict[str, Record], int]:
@@ -289,7 +320,7 @@ def _record(line: bytes) -> Record | None:
         return None
     try:
         record = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) and "key" in record else None
 
@@ -316,11 +347,11 @@ def read_provenance(folder: Path) -> list[Record]:
     if not path.exists():
         return []
     entries = []
-    for line in path.read_text().splitlines():
+    for line in path.read_bytes().splitlines():
         try:
             entry = json.loads(line)
-        except ValueError:
-            continue  # torn by a kill at the very start; the next start wrote its own
+        except (ValueError, RecursionError):
+            continue  # torn by a kill at the very start, maybe in the middle of a letter; the next start wrote its own
         if isinstance(entry, dict):
             entries.append({"start": len(entries) + 1, **entry})
     return entries

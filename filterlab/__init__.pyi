@@ -4,6 +4,7 @@ from .io.volumes import load_volume, save_volume
 from .kernels import KERNELS
 from .methods import METHODS, Method, reconstruct
 from .prefilters import PREFILTERS
+from .recommendation import Recommendation, recommend
 from .resampling import resample
 from .volume import Boundary, Volume, from_grid_sample, from_zyx
 
@@ -14,6 +15,7 @@ __all__ = [
     "Boundary",
     "Field",
     "Method",
+    "Recommendation",
     "Volume",
     "costs",
     "from_grid_sample",
@@ -23,6 +25,7 @@ __all__ = [
     "load_volume",
     "metrics",
     "prefilters",
+    "recommend",
     "reconstruct",
     "render",
     "resample",

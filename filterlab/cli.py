@@ -1,17 +1,21 @@
-"""The command `filterlab`: render | resample | methods | info.
+"""The command `filterlab`: render | resample | recommend | methods | info.
 
 Exit codes: 0 done, 1 a mistake in what was asked (a message on stderr), 2 a command line that makes no sense,
-130 interrupted. What is slow to import is imported by the command that needs it.
+3 `recommend` found nothing within the budget, 130 interrupted.
+
+What is slow to import is imported by the command that needs it.
 """
 
 from __future__ import annotations
 
 import inspect
+import json
 import math
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -26,7 +30,7 @@ if TYPE_CHECKING:
     from filterlab.io.bounded import VolumeHeader
     from filterlab.volume import Volume
 
-OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+OK, FAILED, USAGE, NOTHING_FITS, INTERRUPTED = 0, 1, 2, 3, 130
 BINS = 16
 
 Triple = tuple[float, float, float]
@@ -48,29 +52,47 @@ class Render:
       filterlab render engine.yaml -o engine.png
       filterlab render engine.yaml -o notch.png --method notch --size 512 512
       filterlab render engine.yaml -o zoom.png --camera.window 0.4 0.4 0.6 0.6 --volume other.nrrd
+      filterlab render engine.yaml --explain
     """
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml")]
     """The scene."""
-    output: Output
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
     """The picture to write: a name that ends in .png."""
+    explain: bool = False
+    """Show what the picture would take, and what the scene leaves out; no picture is made."""
 
     def run(self, overrides: dict[str, str]) -> None:
-        from filterlab.io.atomic import check_writable
+        if self.explain == (self.output is not None):
+            raise UsageError("expected either -o FILE.png or --explain; got " + ("both" if self.explain else "neither"))
+        if self.output is not None:
+            self._check_output(self.output)
 
-        if self.output.suffix.lower() != ".png":
-            raise ValueError(f"expected a picture's name that ends in .png; got {self.output}")
-        check_writable(self.output)
-        _check_not_input(self.output, self.scene)
-
-        from filterlab.io.images import save_image
-        from filterlab.render.scene import load_scene, render_scene
+        from filterlab.render.scene import load_scene
 
         scene = load_scene(self.scene, overrides)
-        if scene.volume is not None:
+        if scene.volume is not None and self.output is not None:
             _check_not_input(self.output, Path(scene.volume.file))
         _check_device(scene.device)
+        if self.output is None:
+            from filterlab.render.plan import plan
+            from filterlab.render.plan_report import table
+            from filterlab.render.scene import build
+
+            _show(table(plan(build(scene))))
+            return
+        from filterlab.io.images import save_image
+        from filterlab.render.scene import render_scene
+
         save_image(render_scene(scene, progress=None), self.output)
+
+    def _check_output(self, output: Path) -> None:
+        from filterlab.io.atomic import check_writable
+
+        if output.suffix.lower() != ".png":
+            raise ValueError(f"expected a picture's name that ends in .png; got {output}")
+        check_writable(output)
+        _check_not_input(output, self.scene)
 
 
 @dataclass(frozen=True)
@@ -232,11 +254,145 @@ class Info:
             _show(table)
 
 
+@dataclass(frozen=True)
+class Recommend:
+    """Find the cheapest method whose error on this volume stays within a budget.
+
+    Errors are predicted from the volume's spectrum and measured by leaving out every second sample; costs are measured
+    on this machine. The exit code is 3 when nothing meets the budget (the best there is is shown, and written).
+
+    examples:
+      filterlab recommend engine.nrrd --max-error 0.5%
+      filterlab recommend scan.nii.gz --max-error 1% --task dvr --max-memory 256MiB -o scene.yaml
+      filterlab recommend scan.nii.gz --max-error 0.005 --json
+    """
+
+    volume: Annotated[Positional[Path], arg(metavar="VOLUME")]
+    """The volume: a file, or a folder of numbered TIFF slices."""
+    max_error: Annotated[str, arg(metavar="0.5%")]
+    """The error that is allowed, in parts of the range of the volume's values: 0.5% or 0.005."""
+    task: str = "resample"
+    """What is done with it: resample (values), dvr or isosurface (gradients count as well)."""
+    max_memory: Annotated[str | None, arg(metavar="256MiB")] = None
+    """What the coefficients may take, like 256MiB or 2GB."""
+    max_time: Annotated[str | None, arg(metavar="30s")] = None
+    """What prefiltering and doing the task once may take, like 500ms, 30s or 2min."""
+    boundary: str = "mirror"
+    """How the volume goes on beyond its ends: mirror, reflect, wrap, border or zeros."""
+    nan: str = "refuse"
+    """What becomes of voxels that are NaN: refuse, propagate or fill."""
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="SCENE.yaml")] = None
+    """A scene to write, for `filterlab render`."""
+    json: bool = False
+    """Print the answer as JSON."""
+
+    def run(self, overrides: dict[str, str]) -> int:
+        from filterlab.io.atomic import check_writable
+
+        max_error = quantity("--max-error", self.max_error, {"%": 0.01, "": 1.0})
+        max_memory = quantity("--max-memory", self.max_memory, MEMORY)
+        max_time = quantity("--max-time", self.max_time, TIME)
+        if self.output is not None:
+            if self.output.suffix.lower() not in (".yaml", ".yml"):
+                raise ValueError(f"expected a scene's name that ends in .yaml; got {self.output}")
+            check_writable(self.output)
+            _check_not_input(self.output, self.volume)
+
+        from filterlab import recommendation_report as report
+        from filterlab.io.volumes import load_volume
+        from filterlab.missing_values import CHOICES
+        from filterlab.recommendation import TASKS, recommend
+        from filterlab.volume import Boundary
+
+        for what, name, known in (
+            ("task", self.task, TASKS),
+            ("boundary", self.boundary, Boundary),
+            ("nan", self.nan, CHOICES),
+        ):
+            _check_name(what, name, known)
+        volume = load_volume(self.volume)
+        with _progress_bar() as progress:
+            found = recommend(
+                volume,
+                max_error,
+                task=self.task,
+                max_memory=max_memory,
+                max_time=max_time,
+                boundary=self.boundary,
+                nan=self.nan,
+                progress=progress,
+            )
+        if self.json:
+            print(json.dumps(report.data(found), indent=2))
+        else:
+            _show(report.text(found))
+        if self.output is not None:
+            _write_yaml(self.output, report.scene(found, str(self.volume.resolve()), min(volume.spacing), self.nan))
+        return OK if found.pick is not None else NOTHING_FITS
+
+
+MEMORY = {"": 1.0, "B": 1.0} | {
+    f"{letter}{ending}": base**power
+    for power, letter in enumerate("KMGT", start=1)
+    for ending, base in (("B", 1000.0), ("iB", 1024.0))
+}
+TIME = {"": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+
+
+def quantity(option: str, text: str | None, units: dict[str, float]) -> float:
+    """A positive number with one of the units; infinite for None. Raises UsageError for anything else."""
+    if text is None:
+        return math.inf
+    match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*([A-Za-z%]*)\s*", text)
+    known = {unit.lower(): factor for unit, factor in units.items()}
+    try:
+        value = float(match[1]) * known[match[2].lower()] if match else math.nan
+    except (ValueError, KeyError):
+        value = math.nan
+    if not 0 < value < math.inf:
+        listed = ", ".join(unit for unit in units if unit)
+        raise UsageError(f"expected {option} to be a positive number, with or without a unit ({listed}); got {text!r}")
+    return value
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[float, str], None]]:
+    """A bar on stderr where that is a terminal, else nothing."""
+    if not sys.stderr.isatty():
+        yield lambda done, what: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("reading", total=1.0)
+        yield lambda done, what: bar.update(task, completed=done, description=what)
+
+
+def _write_yaml(path: Path, content: dict[str, Any]) -> None:
+    """A scene, checked as `filterlab render` will check it, then written."""
+    from filterlab.io.atomic import atomic_write
+    from filterlab.io.config import dump_data, loads_config
+    from filterlab.render.scene import Scene
+
+    text = dump_data(content)
+    loads_config(text, Scene, name=str(path))
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 DESCRIPTION = """Reconstruction filters for sampled volumes: look at scans, resample them, compare methods.
 
 filterlab COMMAND --help tells more, with examples. filterlab --version tells the version."""
 
-COMMANDS: dict[str, Any] = {"render": Render, "resample": Resample, "methods": Methods, "info": Info}
+COMMANDS: dict[str, Any] = {
+    "render": Render,
+    "resample": Resample,
+    "recommend": Recommend,
+    "methods": Methods,
+    "info": Info,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -249,7 +405,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if arguments[:1] == ["render"]:
             arguments, overrides = split_overrides(arguments)
-        _parse(arguments or ["--help"]).run(overrides)
+        return _parse(arguments or ["--help"]).run(overrides) or OK
     except SystemExit as exit:  # tyro: --help, or usage
         return exit.code if isinstance(exit.code, int) else USAGE
     except UsageError as error:
@@ -272,7 +428,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("filterlab: interrupted", file=sys.stderr)
         return INTERRUPTED
-    return OK
 
 
 def _parse(arguments: list[str]) -> Any:
@@ -301,6 +456,8 @@ def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]
         if token in ("-o", "--output"):
             known += [token, *rest[:1]]
             del rest[:1]
+        elif token == "--explain":
+            known.append(token)
         elif token.startswith("--") and len(token) > 2 and token != "--help" and not token.startswith("--output="):
             key, equals, value = token[2:].partition("=")
             values = [value] if equals else []
@@ -316,6 +473,11 @@ def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]
 
 def _message(error: ValueError | OSError) -> str:
     """The text of an error; for the operating system's own, what it says about which file."""
+    from filterlab.io.atomic import disk_is_full
+
+    if disk_is_full(error):
+        where = f"cannot write {error.filename}: " if error.filename else ""  # type: ignore[union-attr]
+        return f"{where}the disk is full ({error.strerror})"  # type: ignore[union-attr]
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or ''}: {error.strerror}".removeprefix(": ")
     return str(error)

@@ -30,10 +30,13 @@ FLOORS = {
     "costs": 5,
     "metrics": 5,
     "io": 5,
-    "render": 6,
-    "cli": 8,
-    "__init__": 9,
-    "__main__": 9,
+    "prediction": 6,
+    "recommendation": 7,
+    "recommendation_report": 8,
+    "render": 9,
+    "cli": 10,
+    "__init__": 11,
+    "__main__": 11,
 }
 
 
@@ -99,6 +102,7 @@ PUBLIC = {
     "Boundary",
     "Field",
     "Method",
+    "Recommendation",
     "Volume",
     "costs",
     "from_grid_sample",
@@ -108,6 +112,7 @@ PUBLIC = {
     "load_volume",
     "metrics",
     "prefilters",
+    "recommend",
     "reconstruct",
     "render",
     "resample",

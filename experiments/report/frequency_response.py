@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from experiments.report import plots
 from experiments.report.page import Block, Column, Plot, Section, Table
 from experiments.report.style import label, line_style, text
-from experiments.runs import Record
+from experiments.runs import Record, run_file
 
 if TYPE_CHECKING:
     from experiments.frequency_response import Config
@@ -57,8 +57,8 @@ def _curves(config: Config, index: int, title: str, caption: str, records: Seque
 
 def _response(axes: Axes, record: Record, folder: Path, every: tuple[int, int], *, magnitude: bool) -> None:
     style = line_style(record)
-    omega, closed = np.load(folder / record["omega"]), np.load(folder / record["closed"])
-    at, measured = np.load(folder / record["measured_omega"]), np.load(folder / record["measured"])
+    omega, closed = np.load(run_file(folder, record["omega"])), np.load(run_file(folder, record["closed"]))
+    at, measured = np.load(run_file(folder, record["measured_omega"])), np.load(run_file(folder, record["measured"]))
     if magnitude:
         closed, measured = np.abs(closed), np.abs(measured)
         shown = measured > FLOOR

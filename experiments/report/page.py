@@ -12,7 +12,7 @@ import jinja2
 from markupsafe import Markup
 
 from experiments.report.plots import themed_colors
-from experiments.runs import Record
+from experiments.runs import Record, run_file
 
 TEMPLATE = "page.html.j2"
 
@@ -85,7 +85,7 @@ class Section:
 
 def picture(folder: Path, name: str, label: str, detail: str = "", boxes: Sequence[Sequence[float]] = ()) -> Picture:
     """A picture from an image file that a record names."""
-    content = base64.b64encode((folder / name).read_bytes()).decode()
+    content = base64.b64encode(run_file(folder, name).read_bytes()).decode()
     return Picture(f"data:image/png;base64,{content}", label, detail, boxes)
 
 

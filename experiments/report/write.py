@@ -32,10 +32,10 @@ def write_report(folder: Path) -> Path:
         done=sum(unit.key in records for unit in units),
         total=len(units),
         seconds=sum(record.get("seconds", 0.0) for record in records.values()),
-        config_text=config_file.read_text(),
+        config_text=config_file.read_text(encoding="utf-8"),
         starts=read_provenance(folder),
     )
     path = folder / "report.html"
     with atomic_write(path) as temporary:
-        temporary.write_text(page)
+        temporary.write_text(page, encoding="utf-8")
     return path

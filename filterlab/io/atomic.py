@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import secrets
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +26,7 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
         raise NotADirectoryError(f"cannot write {path}: expected a folder; got {folder}, which is a file")
     if path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: expected a file name; got a folder")
-    if not os.access(folder, os.W_OK | os.X_OK):
+    if not os.access(folder, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
         raise PermissionError(f"cannot write {path}: expected a writable folder; got {folder}, which is not")
     return path
 
@@ -39,7 +42,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     the old file or the new one, never a part. A symbolic link stays a link: the file it points to is replaced.
 
     Raises:
-        OSError: the folder does not exist or is not writable (before the block runs), or the block's own error.
+        OSError: the folder does not exist or is not writable (before the block runs), or the block's own error; one
+            that names no file, or the temporary one, names `path` instead.
     """
     check_writable(path)
     target = Path(os.path.realpath(path))
@@ -48,9 +52,28 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         _flush(temporary)
         os.replace(temporary, target)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, str(temporary)):
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
+
+
+def remove_temporaries(folder: str | os.PathLike[str], older: float = 0.0) -> None:
+    """Removes what writers that were killed left in a folder, where nobody else is writing now.
+
+    Args:
+        folder: the files in it, not below; one that does not exist has none.
+        older: only those that were last written so many seconds ago.
+    """
+    for path in Path(folder).glob(".tmp-*"):
+        if re.match(r"\.tmp-[0-9a-f]{16}(\.|$)", path.name) and time.time() - path.stat().st_mtime >= older:
+            path.unlink(missing_ok=True)
+
+
+def disk_is_full(error: BaseException) -> bool:
+    """Whether an error says that there is no room: on the disk, in a quota, or in a file."""
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def _flush(path: Path) -> None:

@@ -103,7 +103,11 @@ def loads_config(
 
 def dump_config(config: BaseModel) -> str:
     """A YAML text that `load_config` reads back to an equal model. Raises ValueError on numbers that are not finite."""
-    data = config.model_dump(mode="json")
+    return dump_data(config.model_dump(mode="json"))
+
+
+def dump_data(data: Any) -> str:
+    """The same of plain data: mappings, lists, texts, numbers."""
     _check_finite(data, ())
     readable = not re.search("[\x85\u2028\u2029\ufeff]", json.dumps(data, ensure_ascii=False))  # PyYAML folds these
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=readable, width=120)
@@ -242,6 +246,9 @@ def _parse_value(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
         raise ConfigError([Problem(place, "", f"expected valid YAML; got a mistake {reason}")]) from None
     except yaml.YAMLError as error:  # control characters
         raise ConfigError([Problem(name, "", f"expected valid YAML; got {str(error).splitlines()[0]}")]) from None
+    except (ValueError, OverflowError):  # "\\U99999999": PyYAML asks Python for a character that there is not
+        place = f"{name}:{loader.line + 1}" if loader else name
+        raise ConfigError([Problem(place, "", "expected valid YAML; got a character beyond U+10FFFF")]) from None
     finally:
         if loader is not None:
             loader.dispose()
@@ -278,7 +285,9 @@ def _scalar(node: ScalarNode, path: KeyPath) -> str | int | float | bool | None:
             return text.lower() == "true"
         case "int":
             try:
-                return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+                value = int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+                str(value)  # as it is handed on; of a long hexadecimal number only this fails
+                return value
             except ValueError:  # Python's limit on the digits of an integer
                 raise _RefusedError(node, f"{_prefix(path)}expected a number; got {len(text)} digits") from None
         case "float":

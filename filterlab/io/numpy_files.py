@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import warnings
 import zipfile
 import zlib
@@ -27,6 +28,7 @@ from torch import Tensor
 
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import (
+    BLOCK,
     EXPANSION,
     Stored,
     VolumeFileError,
@@ -227,19 +229,44 @@ def _array(volume: Volume) -> np.ndarray:
 def write_npy(volume: Volume, path: Path) -> None:
     """Writes the samples; bfloat16 becomes float32. The geometry is written by `write_sidecar`."""
     with path.open("wb") as file:
-        np.lib.format.write_array(file, _array(volume), allow_pickle=False)
+        write_array(file, _array(volume))
+        file.flush()
+        os.fsync(file.fileno())  # a full disk may tell only now, and must before `write_sidecar`
+
+
+def write_array(file: BinaryIO, array: np.ndarray) -> None:
+    """An array as .npy. Unlike NumPy's own writer it says why where it fails (a full disk)."""
+    array = np.ascontiguousarray(array).reshape(array.shape)  # a number stays a number
+    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
+    content = array.reshape(-1).view(np.uint8).data
+    for first in range(0, len(content), BLOCK):  # what compresses it need not hold all of it
+        file.write(content[first : first + BLOCK])
 
 
 def write_sidecar(volume: Volume, path: Path) -> None:
-    """Writes `path`.yaml for a volume with geometry; removes one that is there for a volume without."""
-    sidecar = sidecar_of(path)
-    if volume.geometry.is_identity:
-        sidecar.unlink(missing_ok=True)
+    """Writes `path`.yaml for a volume with geometry; removes one that is there for a volume without.
+
+    Where that changes what is there, the old samples go first: a process that is killed in between leaves no samples
+    beside a geometry that is not theirs.
+    """
+    sidecar, text = sidecar_of(path), _described(volume)
+    if text == (sidecar.read_text(encoding="utf-8") if sidecar.is_file() else None):
         return
-    affine = tuple(map(tuple, volume.affine.tolist()))
-    found = GeometrySidecar(size=volume.size, affine=affine)  # type: ignore[arg-type]
+    if text is None:
+        path.resolve().unlink(missing_ok=True)
+        sidecar.unlink()
+        return
     with atomic_write(sidecar) as temporary:
-        temporary.write_text(dump_config(found), encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
+        path.resolve().unlink(missing_ok=True)
+
+
+def _described(volume: Volume) -> str | None:
+    """The text of a sidecar; None: voxel centres are the integers, and none is needed."""
+    if volume.geometry.is_identity:
+        return None
+    affine = tuple(map(tuple, volume.affine.tolist()))
+    return dump_config(GeometrySidecar(size=volume.size, affine=affine))  # type: ignore[arg-type]
 
 
 def write_npz(volume: Volume, path: Path) -> None:
@@ -247,4 +274,4 @@ def write_npz(volume: Volume, path: Path) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name, data in (("samples", _array(volume)), ("affine", volume.affine)):
             with archive.open(name + _SUFFIX, "w", force_zip64=True) as stream:
-                np.lib.format.write_array(stream, np.ascontiguousarray(data), allow_pickle=False)
+                write_array(stream, data)  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ Source: TIFF 6.0 (Adobe, 1992) and tifffile's BigTIFF notes.
 
 from __future__ import annotations
 
+import logging
 import re
 import struct
 import zlib
@@ -101,12 +102,23 @@ def _opened(path: Path) -> Iterator[tifffile.TiffFile]:
     with path.open("rb") as file:
         _check_chain(path, file, path.stat().st_size)
     try:
-        with tifffile.TiffFile(path) as tif:
+        with _unlogged(), tifffile.TiffFile(path) as tif:
             yield tif
     except (VolumeFileError, MemoryError):
         raise
     except Exception as error:
         raise VolumeFileError(path, "an intact TIFF file", f"{type(error).__name__}: {error}"[:200]) from None
+
+
+@contextmanager
+def _unlogged() -> Iterator[None]:
+    """Keeps tifffile from logging what is wrong with a file: our own error says it once."""
+    logger = logging.getLogger("tifffile")
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
 
 
 def _check_chain(path: Path, file: BinaryIO, length: int) -> None:

@@ -2,12 +2,12 @@
 
 Everything is prepared by the caller as plain tensors: rays cut to the volume, in coordinates of the coefficients; the
 tables of the transfer function; lights and halfway vectors of every ray. `ops.cpu.march` is the program, on a GPU
-`ops.cuda.march`. No derivatives are recorded here: `March.adjoint` computes them from what `March.run` gave, on the CPU
-only.
+`ops.cuda.march` and `ops.cuda.adjoint`. No derivatives are recorded here: `March.adjoint` computes them from what
+`March.run` gave.
 
 Memory beyond the result: 48 bytes per interval of the transfer function and 32 per bucket (at most 4096) in float32;
 for the adjoint 8 · (9 + 12 K) bytes per ray, K lights, and for derivatives by the coefficients one volume of them per
-thread (within `SPLAT_MEMORY`).
+thread (within `SPLAT_MEMORY`); on a GPU one volume, and 6 KiB per interval of the transfer function.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops import cpu, cuda
+from filterlab.ops.derivatives import GRADIENTS, TABLE_ROW, by_name, columns_of_rays
 from filterlab.ops.fused import STORAGE
 from filterlab.ops.stencil import Stencil
 
@@ -140,7 +141,7 @@ def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dty
 
 
 def on_gpu(tensor: Tensor) -> bool:
-    """Whether rays through these coefficients are marched by the Triton program; it has no adjoint."""
+    """Whether rays through these coefficients are marched by the Triton programs."""
     return tensor.device.type == "cuda"
 
 
@@ -220,24 +221,26 @@ class March:
             length; for "table" positions, colors, opacities; for "shading" ambient, shininess, diffuse, specular,
             toward, halfway. Float64 but for the coefficients' (the dtype of the march).
 
-        The same bits for one number of threads: every thread has rays of its own and adds into partial results of its
-        own, which are summed in order. Those by rays and shading do not depend on the threads at all.
+        On the CPU the same bits for one number of threads: every thread has rays of its own and adds into partial
+        results of its own, which are summed in order. Those by rays and shading do not depend on the threads at all. On
+        a GPU those by coefficients and table are added atomically, and repeat themselves up to rounding only.
         """
-        from filterlab.ops.cpu.march import GRADIENTS, TABLE_ROW, gradient_columns
-
         gradients = tuple(name for name in GRADIENTS if name in wanted)
-        rays, intervals = self.rays.count.shape[0], max(len(self.transfer.positions) - 1, 1)
+        arrays = {"light": light, "light_cotangent": light_cotangent, "depth_cotangent": depth_cotangent}
+        if on_gpu(self.coefficients):
+            from filterlab.ops.cuda import adjoint
+
+            return adjoint.run(self, gradients, arrays, report)
         lights = self.lighting.lights if self.lighting else None
-        columns = gradient_columns(lights)
+        rays, intervals = self.rays.count.shape[0], max(len(self.transfer.positions) - 1, 1)
         threads = self._threads_of_adjoint("coefficients" in gradients)
-        by_ray = torch.zeros(rays, max(c.stop for c in columns.values()), dtype=torch.float64)
+        by_ray = torch.zeros(rays, columns_of_rays(lights), dtype=torch.float64)
         tables = torch.zeros(threads, intervals, TABLE_ROW, dtype=torch.float64)
         volumes = []
         if "coefficients" in gradients:
             volumes = [cpu._zeros((1, *self.coefficients.shape), self.dtype)[0] for _ in range(threads)]
         if rays:
-            cotangents = {"light_cotangent": light_cotangent, "depth_cotangent": depth_cotangent}
-            job = self._job(gradients, light=light, ray_gradient=by_ray, **cotangents)
+            job = self._job(gradients, ray_gradient=by_ray, **arrays)
             own = [_copy(job) for _ in range(threads)]
             for i, one in enumerate(own):
                 one.table_gradient = tables[i].data_ptr()
@@ -245,15 +248,8 @@ class March:
             self._launch_parts(gradients, own, report)
         for part in volumes[1:]:
             volumes[0] += part
-        found: dict[str, Tensor] = {"coefficients": volumes[0]} if volumes else {}
-        if "rays" in gradients:
-            found |= {name: by_ray[:, columns[name]] for name in ("entry", "direction")}
-            found["length"] = by_ray[:, columns["length"]][:, 0]
-        if "table" in gradients:
-            found |= _of_tables(tables.sum(0), len(self.transfer.positions))
-        if "shading" in gradients and lights is not None:
-            found |= _of_shading(by_ray[:, columns["shading"]].sum(0), by_ray[:, columns["view"]], lights)
-        return found
+        volume = volumes[0] if volumes else None
+        return by_name(gradients, volume, by_ray, tables.sum(0), len(self.transfer.positions), lights)
 
     def _threads_of_adjoint(self, with_volumes: bool) -> int:
         """One for every so many rays, and no more volumes of derivatives than memory allows."""
@@ -361,29 +357,6 @@ class March:
 
 def _copy(job: Job) -> Job:
     return type(job).from_buffer_copy(job)
-
-
-def _of_tables(rows: Tensor, points: int) -> dict[str, Tensor]:
-    """Derivatives by both ends of every interval, (intervals, 12), as derivatives by the control points."""
-    by_point = rows.new_zeros(len(rows) + 1, 5)
-    by_point[:-1] += rows[:, 0:10:2]
-    by_point[1:] += rows[:, 1:10:2]
-    if points == 1:
-        by_point = by_point.sum(0, keepdim=True)
-        by_point[:, 0] = 0
-    return {"positions": by_point[:, 0], "opacities": by_point[:, 1], "colors": by_point[:, 2:]}
-
-
-def _of_shading(shading: Tensor, view: Tensor, lights: int) -> dict[str, Tensor]:
-    tints, vectors = shading[2:].reshape(lights, 2, 3), view.reshape(-1, lights, 2, 3)
-    return {
-        "ambient": shading[0],
-        "shininess": shading[1],
-        "diffuse": tints[:, 0],
-        "specular": tints[:, 1],
-        "toward": vectors[:, :, 0],
-        "halfway": vectors[:, :, 1],
-    }
 
 
 def _buckets(x: Tensor, alpha: Tensor) -> Buckets | None:

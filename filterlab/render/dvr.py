@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import SupportsFloat
+from typing import SupportsFloat, SupportsIndex
 
 import torch
 from torch import Tensor
@@ -25,16 +25,17 @@ from torch.utils.checkpoint import checkpoint
 from filterlab.fields.base import Domain, Field
 from filterlab.fields.grid import GridField
 from filterlab.render.camera import Camera, check_size
-from filterlab.render.fused import FusedMarcher, can_be_fused
+from filterlab.render.fused import FusedMarcher, why_not_fused
 from filterlab.render.plain import Chords, Marcher, Medium, PlainMarcher, rays_at_once
 from filterlab.render.rays import Region, check_rays, check_region, intersect, jitter, segment_count
 from filterlab.render.shading import Shading
-from filterlab.render.transfer import TransferFunction
+from filterlab.render.transfer import TransferFunction, absorbed
 
 Rays = tuple[Tensor, Tensor]
 Progress = bool | None | Callable[[int, int], None]
 
 _TILE = 1 << 16  # rays that are cut at a time; more would only leave the caches
+_MOST_SEGMENTS = 2.0**62  # of a ray, that can be counted; no limit on the number of samples is as high
 _BYTES_PER_RAY = 256
 _BYTES_PER_RAY_SAVED = 2048  # of the fused marcher while autograd records
 
@@ -109,6 +110,43 @@ def render(
     Source: Max, Optical models for direct volume rendering, 1995; step and opacity as in Engel et al., Real-Time Volume
     Graphics, 2006.
     """
+    job = prepare(
+        field,
+        camera,
+        transfer,
+        size=size,
+        step=step,
+        shading=shading,
+        background=background,
+        region=region,
+        jitter_seed=jitter_seed,
+        termination=termination,
+        dtype=dtype,
+        device=device,
+        max_samples=max_samples,
+        memory=memory,
+    )
+    return job.run(progress)
+
+
+def prepare(
+    field: Field,
+    camera: Camera | Rays,
+    transfer: TransferFunction,
+    *,
+    size: Sequence[int] | None = None,
+    step: float = 0.5,
+    shading: Shading | None = None,
+    background: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
+    region: Region | None = None,
+    jitter_seed: int | None = None,
+    termination: float | None = None,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str | None = None,
+    max_samples: int = 2**34,
+    memory: int = 2**28,
+) -> Job:
+    """All that `render` decides before it marches; arguments and errors are those of `render`."""
     _check_arguments(field, camera, transfer, shading, step, termination, dtype, max_samples, memory)
     device = torch.device(device or _device_of(camera, transfer))
     view = _View.of(camera, size, device)
@@ -125,30 +163,67 @@ def render(
     brightest = max(brightest, float(color.detach().max()), 1.0)
     transfer = transfer.to(dtype, device)
     faint = 0.0 if termination is None or differentiable else termination / brightest
-    length = step * field.domain.voxel_size
+    asked = float(step) * field.domain.voxel_size
+    length = min(asked, 2 * field.domain.diagonal)  # beyond every end there is nothing to cut, only digits to lose
     media = [Medium(one, transfer, shading, length, faint, differentiable) for one in _unbatched(field)]
-    cut = _Cut(field.domain, box, length, jitter_seed, differentiable)
+    cut = _Cut(field.domain, box, length, asked / length, jitter_seed, differentiable)
     marcher, tile = _marcher(media[0], memory)
     with torch.set_grad_enabled(differentiable):
         parts: Sequence[Tensor | Chords] = view.pixels.split(tile)
         if len(view.pixels) * _BYTES_PER_RAY <= memory:  # else rays are cut again for every image
             parts = [cut(view, pixels) for pixels in parts]
         total = cut.count_all(view, parts, len(media), max_samples)
-        with _reporting(progress, total) as report:
+    return Job(media, marcher, view, cut, parts, total, color, field.channels)
+
+
+@dataclass(frozen=True)
+class Job:
+    """An image that is ready to be marched.
+
+    Attributes:
+        media: what is marched through, one for every image of a batch.
+        marcher: what marches.
+        samples: how many segments all rays have together, before any is skipped or left out behind what is opaque.
+    """
+
+    media: list[Medium]
+    marcher: Marcher
+    _view: _View
+    _cut: _Cut
+    _parts: Sequence[Tensor | Chords]
+    samples: int
+    _background: Tensor
+    _channels: tuple[int, int] | None
+
+    @property
+    def pixels(self) -> int:
+        """Rays of one image."""
+        return len(self._view.pixels)
+
+    def chords(self, pixels: Tensor) -> Chords:
+        """The rays of some pixels, cut into segments."""
+        return self._cut(self._view, pixels)
+
+    def run(self, progress: Progress = False) -> Tensor:
+        """The image, as `render` gives it."""
+        with (
+            torch.set_grad_enabled(self.media[0].differentiable),
+            _reporting(progress, self.samples) as report,
+        ):
             done, tiles = 0, []
-            for medium in media:
-                for part in parts:
-                    chords = part if isinstance(part, Chords) else cut(view, part)
-                    light, depth = marcher.march(medium, chords, lambda n, done=done: report(done + n))
+            for medium in self.media:
+                for part in self._parts:
+                    chords = part if isinstance(part, Chords) else self.chords(part)
+                    light, depth = self.marcher.march(medium, chords, lambda n, done=done: report(done + n))
                     done += int(chords.count.sum())  # with those that early termination saved
-                    tiles.append(_over(light, depth[:, None], color))
-            report(total)
-    return torch.cat(tiles).reshape(*(field.channels or ()), *view.shape, 4)
+                    tiles.append(_over(light, depth[:, None], self._background))
+            report(self.samples)
+        return torch.cat(tiles).reshape(*(self._channels or ()), *self._view.shape, 4)
 
 
 def _marcher(medium: Medium, memory: int) -> tuple[Marcher, int]:
     """The fused marcher where it can run as asked, else the plain one; and how many rays go to it at a time."""
-    if can_be_fused(medium):
+    if why_not_fused(medium) is None:
         if medium.differentiable:  # derivatives by the volume are a volume for every tile
             return FusedMarcher(memory), max(memory // _BYTES_PER_RAY_SAVED, 1)
         return FusedMarcher(memory), max(min(memory // _BYTES_PER_RAY, _TILE), 1)
@@ -205,11 +280,15 @@ class _View:
 
 @dataclass(frozen=True)
 class _Cut:
-    """Cuts rays to a field's domain and into segments; all lengths are world lengths."""
+    """Cuts rays to a field's domain and into segments; all lengths are world lengths.
+
+    The step that was asked for is `stretch` times `step`: more than 1 only where that is longer than any ray inside.
+    """
 
     domain: Domain
     region: Region | None
     step: float
+    stretch: float
     jitter_seed: int | None
     differentiable: bool
 
@@ -220,9 +299,8 @@ class _Cut:
         else:
             entry, direction, length = self.inside(view, pixels)
         offset = self.offset(pixels)
-        return Chords(
-            entry, direction, length, offset, segment_count(length, self.step, offset).clamp_max(2.0**62).long()
-        )
+        count = segment_count(length, self.step, offset).clamp_max(_MOST_SEGMENTS).long()
+        return Chords(entry, direction, length, offset, count)
 
     def inside(self, view: _View, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Where rays enter the domain `(R, 3)`, their directions and lengths inside `(R,)`."""
@@ -237,7 +315,7 @@ class _Cut:
         """How far into a step the first segment reaches, `(R,)`, in (0, 1]."""
         if self.jitter_seed is None:
             return torch.ones_like(pixels, dtype=torch.float64)
-        return jitter(self.jitter_seed, pixels)
+        return (self.stretch * jitter(self.jitter_seed, pixels)).clamp_max(1)
 
     @torch.no_grad()
     def count_all(self, view: _View, parts: Sequence[Tensor | Chords], images: int, limit: int) -> int:
@@ -250,8 +328,9 @@ class _Cut:
                 total += float(segment_count(self.inside(view, part)[2], self.step, self.offset(part)).sum())
         total *= images
         if not total <= limit:
+            more = "more than " if total >= _MOST_SEGMENTS else ""
             raise ValueError(
-                f"the image would take {total:.3g} samples; the limit is max_samples={limit:.3g}: "
+                f"the image would take {more}{total:.3g} samples; the limit is max_samples={limit:.3g}: "
                 "use a longer step, a smaller image or region, or raise max_samples"
             )
         return int(total)
@@ -260,7 +339,7 @@ class _Cut:
 def _over(light: Tensor, depth: Tensor, background: Tensor) -> Tensor:
     """Emitted light `(R, 3)` of rays of optical depth `(R, 1)` over a background `(3,)`: RGB and opacity `(R, 4)`."""
     rgb = light + torch.exp(-depth) * background
-    return torch.cat((rgb, -torch.expm1(-depth)), -1).to(background.dtype)
+    return torch.cat((rgb, absorbed(depth)), -1).to(background.dtype)
 
 
 def _check_arguments(
@@ -287,15 +366,24 @@ def _check_arguments(
         raise TypeError(f"transfer must be a TransferFunction; got {type(transfer).__name__}")
     if not isinstance(shading, Shading | None):
         raise TypeError(f"shading must be a Shading, or None for unlit; got {type(shading).__name__}")
-    if not isinstance(step, SupportsFloat) or not 0 < step < math.inf:
+    if not 0 < _number(step) < math.inf:
         raise ValueError(f"step must be a positive number of voxels; got {step!r}")
-    if termination is not None and (not isinstance(termination, SupportsFloat) or not 0 < termination < 1):
+    if termination is not None and not 0 < _number(termination) < 1:
         raise ValueError(f"termination must be a transmittance between 0 and 1, or None; got {termination!r}")
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64; got {dtype}")
-    for name, value in (("max_samples", max_samples), ("memory", memory)):
-        if not value > 0:
-            raise ValueError(f"{name} must be positive; got {value}")
+    if not _number(max_samples) > 0:
+        raise ValueError(f"max_samples must be a positive number; got {max_samples!r}")
+    if not isinstance(memory, SupportsIndex) or memory <= 0:
+        raise ValueError(f"memory must be a positive whole number of bytes; got {memory!r}")
+
+
+def _number(value: object) -> float:
+    """The value as one number; NaN where it is none."""
+    try:
+        return float(value) if isinstance(value, SupportsFloat) else math.nan
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):  # a tensor of several, an integer beyond all floats
+        return math.nan
 
 
 def _check_background(background: Sequence[float] | Tensor, dtype: torch.dtype, device: torch.device) -> Tensor:

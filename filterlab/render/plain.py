@@ -21,7 +21,7 @@ from torch.utils.checkpoint import checkpoint
 from filterlab.fields.base import Field
 from filterlab.render.rays import segments
 from filterlab.render.shading import Shading
-from filterlab.render.transfer import TransferFunction
+from filterlab.render.transfer import TransferFunction, absorbed
 
 Report = Callable[[int], None]
 """Is told how many samples of the current tile are done."""
@@ -77,6 +77,11 @@ class Medium:
     @property
     def dtype(self) -> torch.dtype:
         return self.transfer.positions.dtype
+
+    @property
+    def order(self) -> int:
+        """The highest derivative of the field that is asked for: none without light."""
+        return 0 if self.shading is None else 1
 
 
 class Marcher(Protocol):
@@ -154,7 +159,7 @@ def _block(medium: Medium, chords: Chords, depth: Tensor, first: int) -> tuple[T
     # gradients come in one pass with values when nearly every sample needs one: when derivatives are asked, or when no
     # value is transparent
     one_pass = shading is not None and (medium.differentiable or not transfer.transparent_somewhere)
-    jet = medium.field.jet(points, 1 if one_pass else 0)
+    jet = medium.field.jet(points, medium.order if one_pass else 0)
     located = transfer.locate(jet[0])
     tau = transfer.optical_depth(transfer.opacity(located), thickness)
     weight, after = _compose(_spread(tau, kept, real.shape), depth, medium.faint)
@@ -183,7 +188,7 @@ def _compose(tau: Tensor, depth: Tensor, faint: float) -> tuple[Tensor, Tensor]:
     sums = tau.cumsum(-1)
     before = torch.cat((torch.zeros_like(sums[:, :1]), sums[:, :-1]), -1) + depth.to(tau.dtype)[:, None]  # never ∞ − ∞
     transmittance = torch.exp(-before)
-    weight = transmittance * -torch.expm1(-tau)
+    weight = transmittance * absorbed(tau)
     if faint > 0:
         weight = torch.where(transmittance < faint, torch.zeros_like(weight), weight)
     return weight, depth + sums[:, -1].double()

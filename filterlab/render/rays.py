@@ -14,7 +14,7 @@ from filterlab.fields.base import Domain
 
 Region = tuple[Sequence[float], Sequence[float]]
 
-# a component of a direction below this is no motion: over any distance that float64 resolves, the ray stays put
+# so small a part of a direction's largest component is no motion: over any distance that float64 resolves, it stays put
 _NO_MOTION = 1e-30
 
 
@@ -39,11 +39,12 @@ def check_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         if not x.detach().isfinite().all():
             raise ValueError(f"{name} must be finite; {int((~x.detach().isfinite()).any(-1).sum())} rays are not")
     directions = directions.double()
+    largest = directions.detach().abs().amax(-1, keepdim=True)
+    if not (largest > 0).all():
+        raise ValueError(f"directions must not be zero; {int((largest == 0).sum())} rays have none")
+    directions = directions / largest  # neither huge nor tiny ones leave the range of their squares
     x, y, z = directions.unbind(-1)
-    length = (x * x + y * y + z * z).sqrt()
-    if not (length.detach() > 0).all():
-        raise ValueError(f"directions must not be zero; {int((length.detach() == 0).sum())} rays have none")
-    return origins.double(), directions / length[..., None]
+    return origins.double(), directions / (x * x + y * y + z * z).sqrt()[..., None]
 
 
 def check_region(region: Region) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
@@ -69,16 +70,18 @@ def slab(origins: Tensor, directions: Tensor, lower: Sequence[float], upper: Seq
 
     Source: Kay & Kajiya, Ray tracing complex scenes, 1986.
     """
-    axes = [_slab(origins[..., d], directions[..., d], lower[d], upper[d]) for d in range(3)]  # whole triples are slow
+    x, y, z = (direction.detach().abs() for direction in directions.unbind(-1))  # whole triples are slow
+    least = _NO_MOTION * torch.maximum(torch.maximum(x, y), z)
+    axes = [_slab(origins[..., d], directions[..., d], least, lower[d], upper[d]) for d in range(3)]
     (near, far), *others = axes
     for other_near, other_far in others:
         near, far = torch.maximum(near, other_near), torch.minimum(far, other_far)
     return near, far
 
 
-def _slab(origin: Tensor, direction: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
-    """The same of one axis."""
-    still = direction.abs() < _NO_MOTION
+def _slab(origin: Tensor, direction: Tensor, least: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
+    """The same of one axis, along which up to the `least` motion is none."""
+    still = direction.abs() <= least
     inside = (origin >= low) & (origin <= high)
     speed = torch.where(still, 1.0, direction)
     a, b = (low - origin) / speed, (high - origin) / speed

@@ -158,6 +158,14 @@ class TransferFunction:
         return torch.lerp(_take(table[:-1], interval), _take(table[1:], interval), fraction)  # exact at both ends
 
 
+def absorbed(depth: Tensor) -> Tensor:
+    """1 − e^{−τ}, the opacity of optical depths τ ≥ 0, `(...)`; derivatives too keep their digits at both ends.
+
+    torch takes the derivative of expm1 as its value plus 1, of which nothing is left where the value is near −1.
+    """
+    return torch.where(depth > 1, 1 - torch.exp(-depth), -torch.expm1(-depth))
+
+
 def _take(table: Tensor, interval: Tensor) -> Tensor:
     return table.index_select(0, interval.reshape(-1)).reshape(interval.shape + table.shape[1:])
 

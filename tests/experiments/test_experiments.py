@@ -96,6 +96,19 @@ def tiny(name, scan):
                 "rays": 20,
             },
         },
+        "fit_kernel": {
+            "classes": [{"kind": "waves", "title": "waves", "bandwidth": 0.5, "waves": 4}],
+            "candidates": [{"kernel": "notch", "prefilter": 3}],
+            "methods": ["triquadratic", "notch"],
+            "resolution": 6,
+            "training": 1,
+            "validation": 1,
+            "test": 1,
+            "points": 10,
+            "test_points": 10,
+            "repetitions": 1,
+            "iterations": 2,
+        },
     }
     configs["equal_error"] = {
         "studies": [{"signal": {"name": "gaussian", "parameters": {"sigma": 0.5}}}],
@@ -128,6 +141,15 @@ def tiny(name, scan):
         "seconds": 0,
         "image_seconds": 0,
         "finest": 32,
+    }
+    configs["recommend_validation"] = {
+        "signals": [{"signal": "gaussian", "resolutions": [16]}],
+        "waves": [{"bandwidths": [0.5], "resolution": 16}],
+        "scans": [str(scan), {"file": "not_here.nrrd", "optional": True}],
+        "tasks": ["resample", "isosurface"],
+        "budgets": [0.05],
+        "points": 200,
+        "seconds": 0.01,
     }
     configs["stability"] = {"methods": ["trilinear"], "cases": ["nan-coordinate"], "amount": 0.02}
     parts = {n: {"experiment": n, "description": f"tiny {n}", **c} for n, c in configs.items()}

@@ -1,6 +1,8 @@
 """Run folders: an interrupted run resumes where it stopped and loses nothing."""
 
+import errno
 import json
+import os
 import signal
 import subprocess
 import time
@@ -10,6 +12,7 @@ import torch
 
 from experiments.__main__ import main
 from experiments.config import ExperimentConfig
+from experiments.report.page import picture
 from experiments.runs import Run, RunError, _commit, config_hash, read_provenance, read_records, run_folder
 
 START = {"started": "2026-01-01T00:00:00+00:00"}
@@ -299,6 +302,84 @@ def test_a_folder_that_cannot_be_written_is_named(tiny_rms, tmp_path, capsys):
     message = capsys.readouterr().err
     assert str(tmp_path / "runs") in message
     assert "Traceback" not in message
+
+
+def test_a_start_torn_in_the_middle_of_a_letter_is_passed_over(tmp_path):
+    folder = tmp_path / "run"
+    with Run.open(folder, config(), {"command": "first"}):
+        pass
+    line = json.dumps({"start": 2, "command": "ünïcode"}, ensure_ascii=False).encode()
+    for cut in (line.index("ü".encode()) + 1, len(line) - 1):
+        with (folder / "provenance.jsonl").open("ab") as file:
+            file.write(line[:cut])
+        with Run.open(folder, config(), {"command": "a\u2028b"}) as run:  # no line ends there
+            assert run.start["command"] == "a\u2028b"
+    assert [start["command"] for start in read_provenance(folder)] == ["first", "a\u2028b", "a\u2028b"]
+
+
+def test_a_line_that_only_looks_like_json_is_no_record(tmp_path):
+    with opened(tmp_path / "run") as run:
+        run.append("a", {})
+    with (tmp_path / "run" / "records.jsonl").open("ab") as file:
+        file.write(b"[" * 100_000 + b"\n")
+    with opened(tmp_path / "run") as run:
+        assert list(run.records) == ["a"]
+
+
+@pytest.mark.parametrize("name", ["../a.png", "/etc/passwd", "files/../../a.png", "a\0.png"])
+def test_files_of_a_record_are_in_the_folder(tmp_path, name):
+    (tmp_path / "a.png").write_bytes(b"")
+    with opened(tmp_path / "run") as run:
+        for read in (run.load_array, run.load_image, lambda name: picture(run.folder, name, "")):
+            with pytest.raises(RunError, match="expected the name of a file in"):
+                read(name)
+        run.append("a", {"files": [name]})
+        with pytest.raises(RunError, match="expected the name of a file in"):
+            run.done("a")
+
+
+@pytest.mark.parametrize("name", ["../a", "/a", "a/../../../b", ".."])
+def test_files_are_written_into_the_folder(tmp_path, name):
+    with opened(tmp_path / "run") as run:
+        for part in (run, run.section("../..")):
+            saved = part.save_array(name, torch.zeros(3))
+            assert saved.startswith("files/")
+            assert (run.folder / saved).resolve().parent == run.folder.resolve() / "files"
+        with pytest.raises(RunError):
+            run.save_array("a\0", torch.zeros(3))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run"]
+
+
+def test_arrays_of_every_shape_are_kept(tmp_path):
+    whole = torch.arange(24.0).reshape(2, 3, 4)
+    with opened(tmp_path / "run") as run:
+        for array in (whole, whole.permute(2, 0, 1), whole[:, ::2], whole[:0], torch.tensor(1.5), whole.double() > 3):
+            found = run.load_array(run.save_array("a", array))
+            assert found.dtype == array.dtype
+            assert torch.equal(found, array)
+
+
+def test_a_record_that_does_not_fit_leaves_no_half_line(tmp_path, monkeypatch):
+    """The disk is full after more and more bytes of a record."""
+    with opened(tmp_path / "run") as run:
+        run.append("a", {})
+        path, write = run.folder / "records.jsonl", os.write
+        before = path.read_bytes()
+        for room in range(0, 24, 5):
+
+            def full(descriptor, data, room=room):
+                if len(data) > room:
+                    write(descriptor, data[:room])
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                return write(descriptor, data)
+
+            monkeypatch.setattr("experiments.runs.os.write", full)
+            with pytest.raises(OSError, match="No space"):
+                run.append("b", {})
+            assert path.read_bytes() == before
+        monkeypatch.undo()
+        run.append("b", {})
+    assert list(read_records(tmp_path / "run")[0]) == ["a", "b"]
 
 
 def test_a_full_disk_keeps_what_was_finished(slow):

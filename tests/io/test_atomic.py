@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
 import pytest
 
-from filterlab.io.atomic import atomic_write, check_writable
+from filterlab.io.atomic import atomic_write, check_writable, disk_is_full, remove_temporaries
 
 
 def test_writes_and_leaves_nothing_else(tmp_path: Path) -> None:
@@ -76,3 +77,27 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
         pytest.skip("this user may write everywhere (root)")
     with pytest.raises(PermissionError, match="writable"):
         check_writable(folder / "a.txt")
+
+
+def test_an_error_of_the_disk_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
+    for number, full in ((errno.ENOSPC, True), (errno.EFBIG, True), (errno.EROFS, False)):
+        with pytest.raises(OSError, match=r"a\.txt") as caught, atomic_write(tmp_path / "a.txt") as temporary:
+            raise OSError(number, "no", str(temporary) if number == errno.EROFS else None)
+        assert caught.value.filename == str(tmp_path / "a.txt")
+        assert caught.value.errno == number
+        assert disk_is_full(caught.value) == full
+    with pytest.raises(FileNotFoundError, match=r"other\.txt"), atomic_write(tmp_path / "a.txt"):
+        (tmp_path / "other.txt").read_text()
+    assert not disk_is_full(ValueError())
+
+
+def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    left = tmp_path / ".tmp-0123456789abcdef.nii.gz"
+    for name in (left.name, ".tmp-mine", "a.tmp-0123456789abcdef", ".tmp-0123456789abcdefg"):
+        (tmp_path / name).write_text("")
+    remove_temporaries(tmp_path, older=60)
+    assert left.exists()
+    os.utime(left, (0, 0))
+    remove_temporaries(tmp_path, older=60)
+    assert sorted(os.listdir(tmp_path)) == [".tmp-0123456789abcdefg", ".tmp-mine", "a.tmp-0123456789abcdef"]
+    remove_temporaries(tmp_path / "missing")

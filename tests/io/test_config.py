@@ -134,6 +134,10 @@ def test_scalars_follow_yaml_1_2(text: str, value: object) -> None:
         ('name: a\nanything: "\\ud800"', 2, "anything: expected Unicode text"),
         ("anything: 1e999", 1, "finite"),
         ("anything: " + "9" * 5000, 1, "5000 digits"),
+        ("name: a\nanything: 0x" + "f" * 5000, 2, "expected a number; got 5002 digits"),
+        ("name: a\ncount: 0o" + "7" * 9000, 2, "expected a number; got 9002 digits"),
+        ('name: a\nanything: "\\U00110000"', 2, "a character beyond U+10FFFF"),
+        ('name: a\nanything: "\\UFFFFFFFF"', 2, "a character beyond U+10FFFF"),
         ("name: a\n5: b", 2, "keys that are text; got 5"),
         ("camera:\n  true: b", 2, "camera: expected keys that are text; got true"),
         ("? [a]\n: b", 1, "keys that are text"),
@@ -306,7 +310,67 @@ def test_anything_plain_survives_dump_and_load(value: Any) -> None:
     assert loads_config(text, Scene).anything == value
 
 
-@given(st.text(max_size=60) | st.text("{}[]:-,&*!|>'\"#% \n\tab1.?", max_size=40))
+# pieces of YAML and of what people write in it, put together at random
+pieces = st.sampled_from(
+    [
+        *(
+            "name: ",
+            "anything: ",
+            "camera: ",
+            "shapes: ",
+            "- ",
+            "? ",
+            ": ",
+            "{",
+            "}",
+            "[",
+            "]",
+            ", ",
+            "\n",
+            "\n  ",
+            "\t",
+        ),
+        *(
+            "'",
+            '"',
+            "#",
+            "&a ",
+            "*a",
+            "!!python/object:os.system ",
+            "!x ",
+            "<<: ",
+            "---\n",
+            "...\n",
+            "%YAML 1.1\n",
+            ">-\n",
+        ),
+        *(
+            "\\n",
+            "\\x41",
+            "\\ud800",
+            "\\U00110000",
+            "\\UFFFFFFFF",
+            ".nan",
+            "-.inf",
+            "1e999",
+            "0x",
+            "0o7",
+            "9" * 20,
+            "true",
+        ),
+        *("null", "~", "=", "\0", "\x85", "\u2028", "\ufeff", "é", "a", "b"),
+    ]
+)
+texts = st.text(max_size=60) | st.text("{}[]:-,&*!|>'\"#% \n\tab1.?\\xuU0", max_size=40)
+
+
+@given(texts | st.lists(pieces, max_size=25).map("".join))
 def test_any_text_is_a_config_or_a_config_error(text: str) -> None:
     with contextlib.suppress(ConfigError):
         assert isinstance(loads_config(text, Scene), Scene)
+
+
+@given(st.dictionaries(st.text(max_size=8), texts, max_size=3))
+def test_any_override_is_a_config_or_a_config_error(overrides: dict[str, str]) -> None:
+    with contextlib.suppress(ConfigError):
+        assert isinstance(loads_config("count: 1", Scene, overrides), Scene)

@@ -15,7 +15,7 @@ pytest.importorskip("triton", reason="the package triton is not installed")
 from filterlab.kernels import LINEAR, bspline
 from filterlab.methods import reconstruct
 from filterlab.ops import Stencil, march
-from filterlab.ops.cuda import launch
+from filterlab.ops.cuda import launch, program
 from filterlab.ops.cuda import march as cuda
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.bricks import bricks_of
@@ -27,17 +27,6 @@ SOFT = TransferFunction(
     [0.1, 0.4, 0.9], [[0.2, 0.3, 0.9], [0.8, 0.5, 0.1], [0.4, 0.9, 0.3]], [0.01, 0.3, 0.1], unit=0.2
 )
 SCENE = {"size": (7, 5), "step": 1.0, "background": (0.1, 0.2, 0.3)}  # 35 rays: more than a program has
-
-
-@pytest.fixture(params=["interpreter", "gpu"])
-def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory):
-    """Where rays are marched; programs run in Triton's interpreter for tensors of the CPU."""
-    if request.param == "gpu" and not torch.cuda.is_available():
-        pytest.skip("no GPU that torch can use")
-    monkeypatch.setenv("TRITON_INTERPRET", str(int(request.param == "interpreter")))
-    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "triton"))
-    with np.errstate(all="ignore"):
-        yield "cpu" if request.param == "interpreter" else "cuda"
 
 
 def moved(prepared: march.March, device: str) -> march.March:
@@ -125,7 +114,7 @@ def test_ends_behind_what_is_opaque(device: str) -> None:
 
 @pytest.mark.parametrize("points", [1, 2, 6])
 def test_any_number_of_control_points(points: int, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda, "BLOCK", 4)  # and of programs: one for every row of the image
+    monkeypatch.setattr(program, "BLOCK", 4)  # and of programs: one for every row of the image
     x = torch.linspace(0.2, 0.8, points, dtype=torch.float64)
     generator = torch.Generator().manual_seed(points)
     rgb, alpha = (torch.rand(points, *more, generator=generator, dtype=torch.float64) for more in ((3,), ()))
@@ -160,7 +149,7 @@ def test_a_thin_medium_keeps_its_digits(opacity: float, device: str) -> None:
     torch.testing.assert_close(shown[1, 1], expected, rtol=1e-5, atol=0)
 
 
-def _blob() -> Tensor:
+def blob() -> Tensor:
     """A bright corner in an empty volume."""
     values = torch.zeros(24, 20, 22, dtype=torch.float64)
     values[2:11, 3:12, 12:20] = 0.2 + torch.rand(9, 9, 8, dtype=torch.float64)
@@ -168,7 +157,7 @@ def _blob() -> Tensor:
 
 
 def test_empty_space_is_left_out_and_changes_no_bit(device: str) -> None:
-    field = reconstruct(_blob(), "triquadratic", scheme="fused")
+    field = reconstruct(blob(), "triquadratic", scheme="fused")
     camera = OrthographicCamera.framing(field.domain, (0.5, 0.6, -0.6))
     transfer = TransferFunction([0.0, 0.1, 1.2], SOFT.colors, [0.0, 0.0, 0.9])
     scene = {"size": (5, 4), "step": 2.0, "shading": LIT, "dtype": torch.float64}
@@ -209,8 +198,8 @@ def test_compiles_for_a_gpu_that_need_not_be_there(monkeypatch: pytest.MonkeyPat
     types = dict.fromkeys(("coefficients", "inner", "opacities", "colors", "shading", "view", "world"), "*fp32")
     types |= dict.fromkeys(("entry", "direction", "length", "offset", "numbers", "light", "optical_depth"), "*fp64")
     types |= {"count": "*i64", "bricks": "*u8", "BLOCK": "constexpr"}
-    program = launch.launchable(cuda.Recipe(Stencil.jet(LINEAR, 1).lowered, 1, skipping=True).write())
-    source = ASTSource(program, {p.name: types.get(p.name, "i32") for p in program.params}, {"BLOCK": cuda.BLOCK})
+    written = launch.launchable(cuda.Recipe(Stencil.jet(LINEAR, 1).lowered, 1, skipping=True).write())
+    source = ASTSource(written, {p.name: types.get(p.name, "i32") for p in written.params}, {"BLOCK": program.BLOCK})
     made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})
     assert "bar.sync" not in made.asm["ptx"]  # one warp waits for nobody
 
@@ -237,21 +226,17 @@ def test_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("shading", [None, LIT])
 def test_render_marches_there(shading: Shading | None, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`render` itself, with a volume on the device; derivatives are the plain marcher's."""
+    """`render` itself, with a volume on the device."""
     if device == "cpu":  # the interpreter's tensors are
         monkeypatch.setattr(march, "on_gpu", lambda tensor: True)
     ran = []
     monkeypatch.setattr(cuda, "run", lambda *a, run=cuda.run: (ran.append(1), run(*a))[1])
-    samples = _blob().to(device).requires_grad_()
+    samples = blob().to(device)
     fields = [reconstruct(samples, "triquadratic", scheme=scheme) for scheme in ("fused", "direct")]
     transfer = TransferFunction([0.0, 0.1, 1.2], SOFT.colors, [0.0, 0.0, 0.9])
     scene = {**SCENE, "size": (4, 3), "shading": shading, "dtype": torch.float64, "device": device}
     camera = OrthographicCamera.framing(fields[0].domain, (0.5, 0.6, -0.6))
-    with torch.no_grad():
-        fused, plain = (render(field, camera, transfer, **scene) for field in fields)
+    fused, plain = (render(field, camera, transfer, **scene) for field in fields)
     assert ran
     assert_same((fused, plain))
     assert fused[..., 3].max() > 0.5
-    ran.clear()
-    assert render(fields[0], camera, transfer, **scene).requires_grad
-    assert not ran

@@ -36,6 +36,7 @@ from filterlab.ops.cpu.lanes import DOUBLE, I8, I32, I64, STORAGE, Lanes, Value,
 from filterlab.ops.cpu.optics import Buckets, Lights, Located, TransferTable, optical_depth, shade
 from filterlab.ops.cpu.tape import Node, Tape
 from filterlab.ops.cpu.taps import Grid, Taps
+from filterlab.ops.derivatives import TABLE_ROW, gradient_columns
 from filterlab.ops.stencil import Lowered
 
 # Arrays are contiguous. R rays, K lights; "number" is the type of the arithmetic, d a double.
@@ -75,8 +76,8 @@ FIELDS: dict[str, type] = {
     "slack": ctypes.c_double,  # by how much a point may be rounded, in voxels
     "light_cotangent": ctypes.c_void_p,  # (R, 3) d
     "depth_cotangent": ctypes.c_void_p,  # (R) d
-    "ray_gradient": ctypes.c_void_p,  # (R, 7) d, lit (R, 9 + 12 K), see `gradient_columns`; written
-    "table_gradient": ctypes.c_void_p,  # (intervals, 12) d, by x₀ x₁ α₀ α₁ r₀ r₁ g₀ g₁ b₀ b₁ – –; added to
+    "ray_gradient": ctypes.c_void_p,  # (R, 7) d, lit (R, 9 + 12 K), see `ops.derivatives`; written
+    "table_gradient": ctypes.c_void_p,  # (intervals, 12) d, see there; added to
     "coefficient_gradient": ctypes.c_void_p,  # (D, H, W) numbers; added to
     "first": ctypes.c_int64,  # rays to be marched: from this one
     "last": ctypes.c_int64,  # to before this one
@@ -85,27 +86,9 @@ FIELDS: dict[str, type] = {
     "chunks": ctypes.c_int64,  # `next` stops here
 }
 
-GRADIENTS = ("coefficients", "rays", "table", "shading")
-"""What the adjoint can compute; rays: entry, direction, length. The march itself has none of them."""
-
 
 class Job(ctypes.Structure):
     _fields_ = list(FIELDS.items())
-
-
-TABLE_ROW = 12  # numbers of a row of both tables together, but for two that mean nothing
-
-
-def gradient_columns(lights: int | None) -> dict[str, slice]:
-    """Where a ray's derivatives stand in a row of `ray_gradient`; None: unlit."""
-    widths = {"entry": 3, "direction": 3, "length": 1}
-    if lights is not None:
-        widths |= {"shading": 2 + 6 * lights, "view": 6 * lights}
-    columns, first = {}, 0
-    for name, width in widths.items():
-        columns[name] = slice(first, first + width)
-        first += width
-    return columns
 
 
 @dataclass(frozen=True)
@@ -113,7 +96,7 @@ class Recipe:
     """Everything the program depends on, apart from the machine.
 
     Attributes:
-        gradients: the adjoint by these (of `GRADIENTS`); empty: the march.
+        gradients: the adjoint by these (of `ops.derivatives.GRADIENTS`); empty: the march.
         stencil: value, and gradient when lit.
         derivatives: the stencil of its rows' derivatives, and `raised` as in `Stencil.derivatives`; for "rays".
         lit: whether there is shading.
@@ -153,7 +136,7 @@ class _Ray:
         length, offset: doubles.
         count: segments.
         leap: how many segments there are, at least, to a voxel (double); for skipping.
-        uniform: by name of `gradient_columns`, packs.
+        uniform: by name of `ops.derivatives.gradient_columns`, packs.
     """
 
     number: Value

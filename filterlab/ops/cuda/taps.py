@@ -40,17 +40,20 @@ class Taps:
 
     Names that the source must have: `width`, `height`, `depth`, `start` (the coordinate of coefficient 0) as 64-bit
     integers, and `arithmetic`, the dtype of points and sums.
+
+    Args:
+        written_out: the largest number of taps whose planes are written out.
     """
 
-    def __init__(self, source: Source, stencil: Lowered) -> None:
+    def __init__(self, source: Source, stencil: Lowered, written_out: int = WRITTEN_OUT) -> None:
         self.source, self.stencil = source, stencil
-        self.written_out = math.prod(stencil.supports) <= WRITTEN_OUT
+        self.written_out = math.prod(stencil.supports) <= written_out
 
     # --- where the points read, and with which weights ---
 
     def locate(self, volume: str) -> None:
-        """From x, y, z: `first`, the address of the first tap in the channel at `volume`; the local coordinates ux, uy,
-        uz; and `nothing`, which is 0 where the point is finite and NaN elsewhere."""
+        """From x, y, z: the number of the first tap, `cell`, and its address `first` in the channel at `volume`; the
+        local coordinates ux, uy, uz; and `nothing`, which is 0 where the point is finite and NaN elsewhere."""
         line = self.source.line
         for axis, size, support in zip(AXES, SIZES, self.stencil.supports, strict=True):
             line(f"shifted = {axis} - {number(support / 2 - 1)}")
@@ -59,7 +62,8 @@ class Taps:
             line(f"base = tl.where(base < start + {size} - {support}, base, start + {size} - {support})")
             line(f"u{axis} = shifted - base")
             line(f"i{axis} = base.to(tl.int64) - start")
-        line(f"first = {volume} + ((iz * height + iy) * width + ix)")
+        line("cell = (iz * height + iy) * width + ix")
+        line(f"first = {volume} + cell")
         line("nothing = ux * 0.0 + uy * 0.0 + uz * 0.0")
 
     def weigh(self) -> None:
@@ -76,18 +80,19 @@ class Taps:
 
     # --- the sums ---
 
-    def contract(self, tap: str) -> None:
+    def contract(self, tap: str, rows: str = "row") -> None:
         """row_0, row_1, …: the rows of the stencil.
 
         Args:
             tap: address of the first tap in the channel.
+            rows: what they are called.
         """
         for r in range(len(self.stencil.rows)):
-            self.source.line(f"row_{r} = nothing")
+            self.source.line(f"{rows}_{r} = nothing")
         for plane in self._planes():
-            self._contract_plane(tap, plane)
+            self._contract_plane(tap, plane, rows)
 
-    def _contract_plane(self, tap: str, plane: Plane) -> None:
+    def _contract_plane(self, tap: str, plane: Plane, rows: str) -> None:
         z, wz = plane
         sums = _Sums(self.source)
         for y in range(self.stencil.supports[1]):
@@ -96,7 +101,7 @@ class Taps:
             for c, weight in wz.items():
                 own = [(factor, f"plane_{a}_{b}") for factor, a, b, function in products if function == c]
                 if own := [term for term in own if term[1] in sums]:
-                    self.source.line(f"row_{r} += {weight} * {_combined(own)}")
+                    self.source.line(f"{rows}_{r} += {weight} * {_combined(own)}")
 
     def _contract_line(self, at: str, y: int, pairs: Iterable[tuple[int, int]], planes: _Sums) -> None:
         """Add line y to the sums over a plane."""
@@ -115,19 +120,20 @@ class Taps:
             if f"line_{a}" in lines:
                 planes.add(f"plane_{a}_{b}", f"{self._weight(1, b, y)} * line_{a}")
 
-    def spread(self, tap: str, mask: str) -> None:
+    def spread(self, tap: str, mask: str, rows: str = "row") -> None:
         """Add row_0, row_1, …, weighted, to the coefficients: the three sums backwards.
 
         Args:
             tap: address of the first tap in the channel.
             mask: which points count.
+            rows: what they are called.
         """
         for z, wz in self._planes():
             planes = _Sums(self.source)
             for r, products in enumerate(self.stencil.rows):
                 for factor, a, b, c in products:
                     if c in wz:
-                        planes.add(f"plane_{a}_{b}", _combined([(factor, f"{wz[c]} * row_{r}")]))
+                        planes.add(f"plane_{a}_{b}", _combined([(factor, f"{wz[c]} * {rows}_{r}")]))
             for y in range(self.stencil.supports[1]):
                 self._spread_line(f"{tap} + ({z} * height + {y}) * width", y, planes, mask)
 
@@ -139,13 +145,13 @@ class Taps:
                 lines.add(f"line_{a}", f"{self._weight(1, b, y)} * plane_{a}_{b}")
         functions = [a for a in range(len(self.stencil.functions[0])) if f"line_{a}" in lines]
         if needed := self._taps_of(functions):
-            self.source.line(f"at = {at}")
+            self.source.line(f"into = {at}")
         values = _Sums(self.source)
         for x in needed:
             for a in functions:
                 if self.stencil.has(0, a, x):
                     values.add(f"tap_{x}", f"{self._weight(0, a, x)} * line_{a}")
-            self.source.line(f'tl.atomic_add(at + {x}, tap_{x}, {mask}, sem="relaxed")')
+            self.source.line(f'tl.atomic_add(into + {x}, tap_{x}, {mask}, sem="relaxed")')
 
     # --- which taps there are ---
 

@@ -1,0 +1,182 @@
+"""A recommendation as people and programs read it: sentences and a table, plain data, a scene."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from filterlab.recommendation import IMAGE, Candidate, Recommendation
+
+COUNTED = {
+    "resample": "RMS of the value",
+    "dvr": "RMS of value or gradient per voxel, whichever is larger, with what the step loses",
+    "isosurface": "RMS of value or gradient per voxel, whichever is larger",
+}
+DONE_ONCE = {
+    "resample": "as many values as there are voxels",
+    "dvr": f"a picture of {IMAGE}² pixels",
+    "isosurface": "value and gradient at as many points as there are voxels",
+}
+
+
+def text(found: Recommendation) -> Group:
+    """Sentences and a table."""
+    return Group(*(Text(line) for line in sentences(found)), _table(found), *(Text(line) for line in _notes(found)))
+
+
+def sentences(found: Recommendation) -> list[str]:
+    """What is counted, and what is recommended; or why nothing is, and the most accurate there is."""
+    low, high = found.value_range
+    lines = [f"Error: {COUNTED[found.task]}, in parts of the range {low:.6g} … {high:.6g}; inner 0.9 of the volume."]
+    chosen = found.chosen
+    if found.pick is not None:
+        lines.append(f"Recommended: {_named(chosen)}, {_interval(chosen)} for a budget of {percent(found.max_error)}.")
+    else:
+        lines.append(f"Nothing meets the budget: {_why_not(found)}")
+        lines.append(f"The most accurate: {_named(chosen)}, {_interval(chosen)}.")
+    return lines
+
+
+def _why_not(found: Recommendation) -> str:
+    accurate = [c for c in found.candidates if c.error.high <= found.max_error]
+    if not accurate:
+        return f"no method here has an error of at most {percent(found.max_error)} on this volume."
+    least_memory, least_time = min(c.memory for c in accurate), min(c.seconds for c in accurate)
+    return (
+        f"methods with an error of at most {percent(found.max_error)} need {size(least_memory)} or more, and "
+        f"{duration(least_time)} or more; asked for at most {_limit(found)}."
+    )
+
+
+def _limit(found: Recommendation) -> str:
+    limits = [(found.max_memory, size), (found.max_time, duration)]
+    return " and ".join(show(value) for value, show in limits if math.isfinite(value)) or "nothing"
+
+
+def _table(found: Recommendation) -> Table:
+    table = Table(box=None, padding=(0, 2))
+    for name in ("", "method", "scheme", "storage", "step"):
+        table.add_column(name)
+    for name in ("error", "predicted", "measured", "time", "per sample", "memory"):
+        table.add_column(name, justify="right")
+    for candidate in (found.chosen, *found.runners_up()):
+        mark = ("→" if found.pick else "best") if candidate is found.chosen else ""
+        measured = candidate.error.measured
+        table.add_row(
+            mark,
+            candidate.method,
+            candidate.scheme,
+            candidate.storage or "as it comes",
+            "–" if candidate.step is None else f"{candidate.step:g}",
+            f"{percent(candidate.error.low)} … {percent(candidate.error.high)}",
+            percent(candidate.error.predicted),
+            "–" if measured is None else percent(measured),
+            duration(candidate.seconds),
+            f"{candidate.nanoseconds:.3g} ns",
+            size(candidate.memory),
+        )
+    return table
+
+
+def _notes(found: Recommendation) -> list[str]:
+    lines = [f"Time: prefilter and {DONE_ONCE[found.task]}, measured on this machine. Memory: coefficients."]
+    lines.append("Predicted: from the spectrum. Measured: every second sample held out, corrected for the resolution.")
+    if found.chosen.error.measured is None:
+        lines.append("Nothing could be held out: an axis has fewer than 16 voxels. The error is predicted only.")
+    if not found.chosen.resolved:
+        lines.append("The volume hardly resolves what it shows: much of the error rests on how its spectrum continues.")
+    return lines
+
+
+def _named(candidate: Candidate) -> str:
+    parts = [f"{candidate.method} ({candidate.scheme})"]
+    parts += [f"stored as {candidate.storage}"] if candidate.storage else []
+    parts += [f"step {candidate.step:g} voxels"] if candidate.step else []
+    return ", ".join(parts)
+
+
+def _interval(candidate: Candidate) -> str:
+    return f"error {percent(candidate.error.low)} … {percent(candidate.error.high)}"
+
+
+def percent(part: float) -> str:
+    """0.00512 -> "0.512 %"."""
+    return f"{100 * part:.3g} %"
+
+
+def duration(seconds: float) -> str:
+    """Seconds in the unit that reads best."""
+    for unit, factor in (("s", 1.0), ("ms", 1e3)):
+        if seconds * factor >= 1:
+            return f"{seconds * factor:.3g} {unit}"
+    return f"{seconds * 1e6:.3g} µs"
+
+
+def size(count: float) -> str:
+    """Bytes in the unit that reads best."""
+    for unit, power in (("GiB", 30), ("MiB", 20), ("KiB", 10)):
+        if count >= 2**power:
+            return f"{count / 2**power:.3g} {unit}"
+    return f"{count:.0f} bytes"
+
+
+def data(found: Recommendation) -> dict[str, Any]:
+    """Plain data, for JSON; limits that were not given are None."""
+
+    def plain(candidate: Candidate | None) -> dict[str, Any] | None:
+        if candidate is None:
+            return None
+        error = candidate.error
+        return {
+            "method": candidate.method,
+            "scheme": candidate.scheme,
+            "storage": candidate.storage,
+            "step": candidate.step,
+            "error": {"low": error.low, "high": error.high, "predicted": error.predicted, "measured": error.measured},
+            "resolved": candidate.resolved,
+            "seconds": candidate.seconds,
+            "nanoseconds_per_sample": candidate.nanoseconds,
+            "memory_bytes": candidate.memory,
+        }
+
+    return {
+        "task": found.task,
+        "max_error": found.max_error,
+        "max_memory": found.max_memory if math.isfinite(found.max_memory) else None,
+        "max_time": found.max_time if math.isfinite(found.max_time) else None,
+        "boundary": found.boundary,
+        "value_range": list(found.value_range),
+        "pick": plain(found.pick),
+        "best": plain(found.best),
+        "runners_up": [plain(c) for c in found.runners_up()],
+    }
+
+
+def scene(found: Recommendation, file: str, voxel: float = 1.0, nan: str = "refuse") -> dict[str, Any]:
+    """A scene that `filterlab render` takes: the volume, reconstructed as recommended, under a ramp of opacity."""
+    low, high = found.value_range
+    span = (high - low) or 1.0
+    chosen = found.chosen
+    method: dict[str, Any] = {"name": chosen.method, "scheme": chosen.scheme, "boundary": found.boundary}
+    method |= {"storage": chosen.storage} if chosen.storage else {}
+    method |= {"nan": nan} if nan != "refuse" else {}
+    points = [(0.15, (0.1, 0.15, 0.3), 0.0), (0.5, (0.75, 0.55, 0.4), 0.15), (1.0, (1.0, 0.97, 0.9), 0.6)]
+    return {
+        "description": f"{chosen.method}, recommended for an error of {percent(found.max_error)} ({found.task})",
+        "volume": file,
+        "method": method,
+        "transfer": {
+            "unit": voxel,
+            "points": [
+                {"value": low + part * span, "color": list(color), "opacity": opacity}
+                for part, color, opacity in points
+            ],
+        },
+        "step": chosen.step or 0.5,
+        "lighting": {"ambient": 0.3, "diffuse": 0.7},
+        "termination": 0.002,
+    }
