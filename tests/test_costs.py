@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import weakref
 from types import SimpleNamespace
 
 import pytest
@@ -155,6 +156,41 @@ def test_a_slow_first_call_is_not_taken_for_the_usual_one(monkeypatch):
     found = measure({"A": lambda: field}, torch.rand(100, 3), seconds=1e3)
     assert len(found["A"].rounds) == costs.ROUNDS
     assert len(field.asked) > 40 * costs.ROUNDS
+
+
+def test_fields_are_built_anew_in_every_round_and_one_is_held_at_a_time(monkeypatch):
+    """Where the memory of a field happens to lie may make it slow: not in all rounds alike."""
+    clock, alive = Clock(monkeypatch), []
+
+    def build(name):
+        clock.now += 1.0
+        field = Counting(clock)
+        field.name = name
+        alive.append(weakref.ref(field))
+        assert sum(ref() is not None for ref in alive) <= 2
+        return field
+
+    found = measure({name: lambda name=name: build(name) for name in "AB"}, torch.rand(10, 3), seconds=1e-9)
+    assert len(alive) == 2 * (1 + 1 + costs.LEAST_ROUNDS), "a first time, once to see how long it takes, and in rounds"
+    assert all(c.build.median == 1 and c.sample.median == pytest.approx(1000) for c in found.values())
+
+
+def test_every_candidate_is_sampled_at_its_own_field(monkeypatch):
+    clock, asked = Clock(monkeypatch), []
+
+    class Named(Counting):
+        def jet(self, points, order):
+            asked.append((self.name, len(points)))
+            return super().jet(points, order)
+
+    def build(name):
+        field = Named(clock)
+        field.name = name
+        return field
+
+    points = {"A": torch.rand(10, 3), "B": torch.rand(20, 3)}
+    measure({name: lambda name=name: build(name) for name in "AB"}, points, seconds=0)
+    assert set(asked) == {("A", 10), ("B", 20)}
 
 
 def test_another_clock_can_be_asked(monkeypatch):
