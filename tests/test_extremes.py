@@ -9,13 +9,12 @@ import pytest
 from experiments.extremes import CASES, document
 from experiments.extremes.contract import Case, Finding, Subject, Tally, random_numbers
 
-AMOUNT = 0.1
 BY_CASE = [(case, subject) for case in CASES.values() for subject in case.subjects()]
 
 
 @pytest.mark.parametrize(("case", "subject"), BY_CASE, ids=[f"{case.key}-{subject.key}" for case, subject in BY_CASE])
 def test_the_contract_is_kept(case: Case, subject: Subject) -> None:
-    finding = case.run(subject, seed=2, amount=AMOUNT)
+    finding = case.run(subject, seed=2, amount=case.tested)
     if finding.skipped:
         pytest.skip(finding.skipped)
     assert finding.holds, finding
