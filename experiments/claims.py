@@ -52,8 +52,9 @@ class Evidence:
         found = {}
         for i, signal in enumerate(self.signals):
             for n in resolutions or self.resolutions:
-                errors = [self.records.get(f"error/{i}/{n}/{key}", {}).get(quantity) for key in (above, *below)]
-                if all(errors):
+                known = [self.records.get(f"error/{i}/{n}/{key}", {}).get(quantity) for key in (above, *below)]
+                errors = [e for e in known if e]
+                if len(errors) == len(known):
                     found[f"{signal} {n}³"] = errors[0] / min(errors[1:])
         return found
 
@@ -65,7 +66,7 @@ class Evidence:
                 entries = {(e["recipe"], e["step"]): e["psnr"] for e in record["entries"]}
                 step = min(s for _, s in entries)
                 pair = entries.get((better, step)), entries.get((worse, step))
-                if None not in pair:
+                if pair[0] is not None and pair[1] is not None:
                     where = f"{self.signals[record['source']]} {record['resolution']}³"
                     found.setdefault(where, pair[0] - pair[1])
         return found

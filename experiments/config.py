@@ -187,10 +187,12 @@ class VolumeChoice(StrictModel):
     Attributes:
         file: a path, a file in the folder of $FILTERLAB_VOLUMES, or `package:path` (see `volume_path`).
         frame: which volume of a NIfTI time series; see `filterlab.load_volume`.
+        optional: left out where there is no such file, by experiments that say so.
     """
 
     file: Annotated[str, Field(min_length=1)]
     frame: Annotated[int, Field(ge=0)] | None = None
+    optional: bool = False
 
     @model_validator(mode="before")
     @classmethod
@@ -209,6 +211,14 @@ class VolumeChoice(StrictModel):
         except (ValueError, OSError) as error:
             raise ConfigError([Problem(self.file, path, str(error))]) from None
         return Domain.of_grid(header.size, header.geometry)
+
+    @property
+    def present(self) -> bool:
+        """Whether it counts: it is there, or it has to be."""
+        try:
+            return bool(volume_path(self.file)) or not self.optional
+        except ValueError:
+            return not self.optional
 
     def extent(self) -> float:
         """Voxels along an axis, the geometric mean of the three; 128 where the file can't be read here."""
@@ -232,7 +242,8 @@ def input_files(config: BaseModel) -> dict[str, str]:
     Raises:
         ValueError, OSError: a file that is not there or can't be read.
     """
-    files = {file for choice in _volume_choices(config) for file in files_of(volume_path(choice.file))}
+    present = (choice for choice in _volume_choices(config) if choice.present)
+    files = {file for choice in present for file in files_of(volume_path(choice.file))}
     return {str(file): _digest(file) for file in sorted(files)}
 
 

@@ -78,7 +78,7 @@ def error_kernel(kernel: PiecewisePolynomial, prefiltering: Tensor, omega: Tenso
     E(ω)² = (1 − P(ω)Φ(ω))² + P(ω)² Σ_{k≠0} Φ(ω + 2πk)²: what is lost of the wave, and what it leaves at its aliases.
     `prefiltering` is P at the ω. Aliases up to |k| = 64; Φ² falls as ω⁻⁴ at the least.
 
-    Source: Blu & Unser, Quantitative Fourier analysis of approximation techniques, 1999, eq. 6.
+    Source: Blu & Unser, Quantitative Fourier analysis of approximation techniques, part I, 1999.
     """
     lost = 1 - prefiltering * kernel_response(kernel, omega)
     return (lost.square() + prefiltering.square() * _aliases(kernel, omega)).sqrt()

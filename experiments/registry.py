@@ -27,6 +27,7 @@ _NAMES = (
     "speed_accuracy",
     "equal_error",
     "fit_kernel",
+    "recommend_validation",
     "stability",
     "demo",
 )

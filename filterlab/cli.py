@@ -52,29 +52,47 @@ class Render:
       filterlab render engine.yaml -o engine.png
       filterlab render engine.yaml -o notch.png --method notch --size 512 512
       filterlab render engine.yaml -o zoom.png --camera.window 0.4 0.4 0.6 0.6 --volume other.nrrd
+      filterlab render engine.yaml --explain
     """
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml")]
     """The scene."""
-    output: Output
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
     """The picture to write: a name that ends in .png."""
+    explain: bool = False
+    """Show what the picture would take, and what the scene leaves out; no picture is made."""
 
     def run(self, overrides: dict[str, str]) -> None:
-        from filterlab.io.atomic import check_writable
+        if self.explain == (self.output is not None):
+            raise UsageError("expected either -o FILE.png or --explain; got " + ("both" if self.explain else "neither"))
+        if self.output is not None:
+            self._check_output(self.output)
 
-        if self.output.suffix.lower() != ".png":
-            raise ValueError(f"expected a picture's name that ends in .png; got {self.output}")
-        check_writable(self.output)
-        _check_not_input(self.output, self.scene)
-
-        from filterlab.io.images import save_image
-        from filterlab.render.scene import load_scene, render_scene
+        from filterlab.render.scene import load_scene
 
         scene = load_scene(self.scene, overrides)
-        if scene.volume is not None:
+        if scene.volume is not None and self.output is not None:
             _check_not_input(self.output, Path(scene.volume.file))
         _check_device(scene.device)
+        if self.output is None:
+            from filterlab.render.plan import plan
+            from filterlab.render.plan_report import table
+            from filterlab.render.scene import build
+
+            _show(table(plan(build(scene))))
+            return
+        from filterlab.io.images import save_image
+        from filterlab.render.scene import render_scene
+
         save_image(render_scene(scene, progress=None), self.output)
+
+    def _check_output(self, output: Path) -> None:
+        from filterlab.io.atomic import check_writable
+
+        if output.suffix.lower() != ".png":
+            raise ValueError(f"expected a picture's name that ends in .png; got {output}")
+        check_writable(output)
+        _check_not_input(output, self.scene)
 
 
 @dataclass(frozen=True)
@@ -438,6 +456,8 @@ def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]
         if token in ("-o", "--output"):
             known += [token, *rest[:1]]
             del rest[:1]
+        elif token == "--explain":
+            known.append(token)
         elif token.startswith("--") and len(token) > 2 and token != "--help" and not token.startswith("--output="):
             key, equals, value = token[2:].partition("=")
             values = [value] if equals else []

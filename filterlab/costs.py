@@ -123,6 +123,7 @@ def measure(
         tick: told which fraction is done.
 
     All fields are kept until the end: memory is the sum of their coefficients, and of one more while they are built.
+    (Building them anew in every round was tried: fresh memory is slower, and not for all alike.)
 
     Returns:
         name -> `Cost`, in the order of the candidates.

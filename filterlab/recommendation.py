@@ -38,6 +38,7 @@ _WHOLE = 96**3  # voxels of a volume that is one block
 _POINTS = 6000  # of a block at which a rebuilt field is compared
 _CROP = 160  # voxels along an axis of the part that costs are measured on
 _RAYS, _SAMPLES = 128, 64
+_RESOLVED = 0.1  # or less of the squared error comes from beyond the Nyquist frequency
 _DOUBT = 1.02  # of what is measured: by so much a method may be further off than it seems, the sampling apart
 _UNMEASURED = 1.5  # and so much where nothing could be held out
 
@@ -269,7 +270,7 @@ class _MethodErrors:
         measured = None if self.measured is None else counted(self.measured)
         known = [predicted] if measured is None else [predicted, measured]
         doubt = (_UNMEASURED if measured is None else _DOUBT) * math.sqrt(1 + self.spread)
-        return ErrorEstimate(predicted, measured, min(known) / doubt, max(known) * doubt), self.beyond < 0.3
+        return ErrorEstimate(predicted, measured, min(known) / doubt, max(known) * doubt), self.beyond < _RESOLVED
 
 
 @dataclass(frozen=True)

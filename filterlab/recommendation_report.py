@@ -25,10 +25,11 @@ DONE_ONCE = {
 
 def text(found: Recommendation) -> Group:
     """Sentences and a table."""
-    return Group(*(Text(line) for line in _sentences(found)), _table(found), *(Text(line) for line in _notes(found)))
+    return Group(*(Text(line) for line in sentences(found)), _table(found), *(Text(line) for line in _notes(found)))
 
 
-def _sentences(found: Recommendation) -> list[str]:
+def sentences(found: Recommendation) -> list[str]:
+    """What is counted, and what is recommended; or why nothing is, and the most accurate there is."""
     low, high = found.value_range
     lines = [f"Error: {COUNTED[found.task]}, in parts of the range {low:.6g} … {high:.6g}; inner 0.9 of the volume."]
     chosen = found.chosen

@@ -157,6 +157,24 @@ def test_a_slow_first_call_is_not_taken_for_the_usual_one(monkeypatch):
     assert len(field.asked) > 40 * costs.ROUNDS
 
 
+def test_every_candidate_is_sampled_at_its_own_field(monkeypatch):
+    clock, asked = Clock(monkeypatch), []
+
+    class Named(Counting):
+        def jet(self, points, order):
+            asked.append((self.name, len(points)))
+            return super().jet(points, order)
+
+    def build(name):
+        field = Named(clock)
+        field.name = name
+        return field
+
+    points = {"A": torch.rand(10, 3), "B": torch.rand(20, 3)}
+    measure({name: lambda name=name: build(name) for name in "AB"}, points, seconds=0)
+    assert set(asked) == {("A", 10), ("B", 20)}
+
+
 def test_another_clock_can_be_asked(monkeypatch):
     clock = Clock(monkeypatch)
     found = measure({"A": lambda: Counting(clock)}, torch.rand(10, 3), seconds=0.1, clock=lambda: 2 * clock.now)

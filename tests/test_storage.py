@@ -90,9 +90,9 @@ def test_the_fused_march_shows_what_the_plain_one_shows(storage, shading, monkey
     camera, transfer = scene(field)
     transfer = TransferFunction(10 * transfer.positions, transfer.colors, transfer.opacities)
     options = {"size": (24, 20), "shading": shading}
-    assert fused.can_be_fused(medium_of(field, transfer, shading))
+    assert fused.why_not_fused(medium_of(field, transfer, shading)) is None
     image = render(field, camera, transfer, **options)
-    monkeypatch.setattr("filterlab.render.dvr.can_be_fused", lambda medium: False)
+    monkeypatch.setattr("filterlab.render.dvr.why_not_fused", lambda medium: "told so")
     plain = render(field, camera, transfer, **options)
     assert float(image[..., 3].max()) > 0.5
     torch.testing.assert_close(image, plain, rtol=0, atol=2e-5)
@@ -112,7 +112,7 @@ def test_an_image_of_integers_is_differentiable_in_the_transfer_function(storage
     for allowed in (True, False):
         tables = [t.clone().requires_grad_() for t in (transfer.positions, transfer.colors, transfer.opacities)]
         if not allowed:
-            monkeypatch.setattr("filterlab.render.dvr.can_be_fused", lambda medium: False)
+            monkeypatch.setattr("filterlab.render.dvr.why_not_fused", lambda medium: "told so")
         image = render(field, camera, TransferFunction(*tables), size=(10, 9), dtype=torch.float64)
         image.square().sum().backward()
         found.append([t.grad for t in tables])
@@ -124,7 +124,7 @@ def test_an_image_of_integers_is_differentiable_in_the_transfer_function(storage
 def test_control_points_that_rounding_would_join_are_not_joined():
     field = built(samples(8, 8, 8) * 1e4, "trilinear", storage="uint8")
     near = TransferFunction([0.0, 1e-6, 5.0], torch.ones(3, 3), [0.0, 0.5, 0.1])
-    assert not fused.can_be_fused(medium_of(field, near, None))
+    assert "fall together" in str(fused.why_not_fused(medium_of(field, near, None)))
 
 
 @pytest.mark.parametrize("storage", ["float32", "float16", "bfloat16"])

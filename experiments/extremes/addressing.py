@@ -160,6 +160,22 @@ def _run_the_last(function: Callable[[int], object], job: Any, count: int) -> No
     function(ctypes.addressof(job))
 
 
+def many_segments(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """A ray of 3·10⁹ segments: the count is exact, and an image of it is refused before it is marched."""
+    tally = Tally()
+    field = fl.reconstruct(torch.rand(8, 8, 8), "trilinear")
+    rays = torch.tensor([[-3.0, 4, 4]], dtype=torch.float64), torch.tensor([[1.0, 0, 0]], dtype=torch.float64)
+    transfer = TransferFunction([0.0, 1.0], [[1.0, 1, 1]] * 2, [0.1, 0.1])
+    for exponent in random.uniform(31.5, 60, max(int(20 * amount), 4)):
+        step = 8.0 / 2.0**exponent
+        try:
+            render(field, rays, transfer, step=step, max_samples=2**31)
+            tally.kept(False, f"an image of 2^{exponent:.1f} samples was begun")
+        except ValueError as error:
+            tally.kept(f"{2.0**exponent:.3g} samples" in str(error), f"another count than 2^{exponent:.3f}: {error}")
+    return tally.finding()
+
+
 PROMISE = "Addresses have 64 bits: what stands beyond 2³¹ is what it would be in a small volume, within 2·10⁻⁶."
 CASES = (
     Case("many-voxels", "a volume of 1,300³ > 2³¹ voxels", PROMISE, many_voxels, ("method", "scheme"), 0.1),
@@ -180,4 +196,12 @@ CASES = (
         0.2,
     ),
     Case("many-points", "2³¹ + 5 points", "The last ones have the bits that they have alone.", many_points, (), 0.2),
+    Case(
+        "many-segments",
+        "10⁹ … 10¹⁸ samples of a ray",
+        "Counted without wrapping round, and refused with the count before anything is marched.",
+        many_segments,
+        (),
+        0.1,
+    ),
 )

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING
 from experiments.report.claims import claims_table
 from experiments.report.page import Block, Column, Gallery, Section, Table, picture
 from experiments.report.style import MISSING, fixed, label, memory, text, times
-from experiments.report.trade_plots import fronts_plot, images_plot, memory_plot, precision_plot, schemes_plot
+from experiments.report.trade_plots import (
+    fronts_plot,
+    images_plot,
+    memory_plot,
+    precision_plot,
+    same_method,
+    schemes_plot,
+)
 from experiments.runs import Record
 
 if TYPE_CHECKING:
@@ -34,7 +41,12 @@ def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section
         _precision(config, records),
     ]
     title = "Speed against accuracy"
-    return Section(title, _lead(config), blocks, [p for p in parts if p.blocks or p.sections])
+    return Section(
+        title,
+        [*_lead(config), *_in_short(config, records, middle)],
+        blocks,
+        [p for p in parts if p.blocks or p.sections],
+    )
 
 
 def _lead(config: Config) -> list[str]:
@@ -47,6 +59,30 @@ def _lead(config: Config) -> list[str]:
         "rounds, ratios within rounds. Points lie along slanted parallel rays, half a voxel apart, unless said "
         "otherwise.",
     ]
+
+
+def _in_short(config: Config, records: Mapping[str, Record], n: int) -> list[str]:
+    """The front of the gradient of the first signal, and how many claims hold, in words."""
+    said, costs = [], _costs(records, n, "gradient-rays")
+    members = [k for k in _in_order(records, 0, n) if "gradient" in _on_front(records, 0, n)[k]]
+    if members:
+        listed = "; ".join(
+            f"{name(config, costs[k])} for {fixed(costs[k]['ns_per_sample'][1], 1)} ns "
+            f"({text(records[f'error/0/{n}/{k}']['gradient_rms'])})"
+            for k in members
+        )
+        said.append(
+            f"In short, {config.sources[0].signal.label} at {n}³: worth their cost for value and gradient (RMS error "
+            f"of the gradient) are {listed}."
+        )
+    claims = [c["verdict"] for c in records.get("claims", {}).get("claims", ())]
+    if claims:
+        holds, partly, fails = (claims.count(v) for v in ("holds", "in part", "does not hold"))
+        said.append(
+            f"Of {len(claims)} claims of the paper about cost and quality {holds} hold on this machine, {partly} do in "
+            f"part, {fails} do not."
+        )
+    return said
 
 
 def _costs(records: Mapping[str, Record], n: int, work: str) -> Mapping[str, Record]:
@@ -86,7 +122,7 @@ def _overview(config: Config, records: Mapping[str, Record], index: int, n: int)
     fronts = _on_front(records, index, n)
     rows = []
     for key, row in zip(first, table.rows, strict=True):
-        own = {k: costs[k]["variant"] for k in fronts if _same(costs[k], costs[key])}
+        own = {k: costs[k]["variant"] for k in fronts if same_method(costs[k], costs[key])}
         said = [f"{q}{'' if k == key else f' ({v})'}" for k, v in own.items() for q in fronts[k]]
         rows.append([*row[:build], ", ".join(said) or MISSING])
     return [replace(table, columns=[*table.columns[:build], table.columns[-1]], rows=rows)]
@@ -113,7 +149,7 @@ def _table(
         cells = _row(config, records, index, n, key)
         rows.append([f"{n}³" if n != last else "", *cells] if several else cells)
         last = n
-    return Table([Column("", numeric=False), *columns] if several else columns, rows, caption)
+    return Table([Column("", numeric=False), *columns] if several else columns, rows, caption, wrapped=True)
 
 
 def _row(config: Config, records: Mapping[str, Record], index: int, n: int, key: str) -> list[str]:
@@ -227,7 +263,7 @@ def _image_table(config: Config, record: Record) -> Table:
         cells = [fixed(e["psnr"], 2), fixed(e["ssim"], 4), text(e["max"], 2), median, f"{low} … {high}"]
         rows.append([", ".join([label(e), *how]), *cells])
     study = config.images[record["study"]]
-    caption = f"{study.title.capitalize()}: images at {record['resolution']}³, a step of {study.steps[0]:g} voxels."
+    caption = f"{study.title.capitalize()}: images at {record['resolution']}³, step {study.steps[0]:g} (voxels)."
     return Table(columns, rows, caption)
 
 
@@ -250,21 +286,18 @@ def _scheme_table(config: Config, records: Mapping[str, Record], n: int) -> Tabl
     columns = [Column("method", numeric=False), *(Column(v, "ns") for v in variants)]
     rows = []
     for recipe in config.methods:
-        own = {r["variant"]: r for r in costs.values() if _same(r, recipe.record())}
+        own = {r["variant"]: r for r in costs.values() if same_method(r, recipe.record())}
         cells = [fixed(own[v]["ns_per_sample"][1], 1) if v in own else MISSING for v in variants]
         rows.append([label(recipe.record()), *cells])
     caption = f"Nanoseconds per value and gradient at {n}³, points along rays. A dash: the method does not offer it."
     return Table(columns, rows, caption)
 
 
-def _same(record: Record, recipe: Record) -> bool:
-    return all(record[k] == recipe[k] for k in ("method", "prefilter", "gradient"))
-
-
 def _precision(config: Config, records: Mapping[str, Record]) -> Section:
-    plots = [p for i in range(len(config.sources)) if (p := precision_plot(config, records, i)) is not None]
+    plot = precision_plot(config, records)
     lead = (
-        "Storage rounds every coefficient once; arithmetic stays in float32. Shorter storage saves memory always, and "
-        "time only where reading is what takes it: volumes beyond the caches, points at random.",
+        "Storage rounds every coefficient once; arithmetic stays in float32 (float64: samples, points and arithmetic). "
+        "Shorter storage always saves memory. It saves time only where reading takes most of it, because stored "
+        "numbers must be widened before they are summed.",
     )
-    return Section("Precision", lead, plots)
+    return Section("Precision", lead, [] if plot is None else [plot])

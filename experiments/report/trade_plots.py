@@ -14,7 +14,7 @@ from experiments.report.style import label, line_style, look
 from experiments.runs import Record
 
 if TYPE_CHECKING:
-    from experiments.speed_accuracy import Config
+    from experiments.speed_accuracy import Config, Variant
 
 Namer = Callable[..., str]
 QUANTITIES = (("value_rms", "value-rays", "value"), ("gradient_rms", "gradient-rays", "gradient"))
@@ -118,7 +118,9 @@ def _front(axes: Axes, corners: Sequence[tuple[float, float]], names: Sequence[s
     low, high = axes.get_ylim()
     axes.set_ylim(low, high * (high / low) ** (0.06 * len(names)))  # room for the list
     listed = "\n".join(f"{i}  {name}" for i, name in enumerate(names, 1))
-    axes.text(0.98, 0.99, listed, transform=axes.transAxes, ha="right", va="top", fontsize=7, linespacing=1.35)
+    axes.text(
+        0.98, 0.99, listed, transform=axes.transAxes, ha="right", va="top", fontsize=7, linespacing=1.35, ma="left"
+    )
 
 
 def memory_plot(config: Config, records: Mapping[str, Record], index: int, name: Namer) -> Plot:
@@ -193,7 +195,9 @@ def schemes_plot(config: Config, records: Mapping[str, Record], n: int) -> Plot:
         figure = plots.canvas(10.4, 0.42 * len(methods) + 1.3)
         axes = figure.subplots()
         for y, recipe in enumerate(methods):
-            own = [r for r in costs.values() if _of(r, recipe) and r["storage"] == "default" and _single(config, r)]
+            own = [
+                r for r in costs.values() if same_method(r, recipe) and r["storage"] == "default" and _single(config, r)
+            ]
             x = [r["ns_per_sample"][1] for r in own]
             axes.plot([min(x), max(x)], [y, y], color=plots.RULE, linewidth=1.0, zorder=1)
             for r in own:
@@ -215,14 +219,16 @@ def schemes_plot(config: Config, records: Mapping[str, Record], n: int) -> Plot:
         shown = [s for s in words if any(r["scheme"] == s for r in costs.values())]
         handles = [Line2D([], [], color=plots.INK, marker=markers[s], linestyle="none", label=words[s]) for s in shown]
         if any(r["sampler"] != "exact" for r in costs.values()):
-            style = {"color": plots.INK, "marker": "D", "markerfacecolor": "none", "linestyle": "none"}
-            handles.append(Line2D([], [], label="with 8-bit fractions", **style))
+            hollow = Line2D([], [], color=plots.INK, marker="D", markerfacecolor="none", linestyle="none")
+            hollow.set_label("with 8-bit fractions")
+            handles.append(hollow)
         figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
         drawn = plots.svg(figure, "schemes")
     return Plot(drawn, f"Time per value and gradient by scheme, float32, at {n}³ (logarithmic).")
 
 
-def _of(record: Record, recipe: Record) -> bool:
+def same_method(record: Record, recipe: Record) -> bool:
+    """Whether they differ by no more than the variant."""
     return all(record[k] == recipe[k] for k in ("method", "prefilter", "gradient"))
 
 
@@ -230,43 +236,55 @@ def _single(config: Config, record: Record) -> bool:
     return next(v for v in config.variants if v.name == record["variant"]).dtype == "float32"
 
 
-def precision_plot(config: Config, records: Mapping[str, Record], index: int) -> Plot | None:
-    """What a precision does to error, time and memory of every method, at the finest resolution."""
-    n = config.resolutions[-1]
-    variants = [v for v in config.variants if v.scheme is None]
-    if len(variants) < 2 or f"front/{index}" not in records:
+def precision_plot(config: Config, records: Mapping[str, Record]) -> Plot | None:
+    """What a precision does to errors (a row for each signal) and times, at the finest resolution."""
+    n, sources = config.resolutions[-1], [i for i in range(len(config.sources)) if f"front/{i}" in records]
+    names = [v.name for v in sorted(config.variants, key=_bits) if v.scheme is None]
+    if len(names) < 2 or not sources:
         return None
-    names = [v.name for v in variants]
-    panels = (
-        ("value_rms", "value-rays", "RMS error of the value ÷ first", "error"),
-        ("gradient_rms", "gradient-rays", "RMS error of the gradient ÷ first", "error"),
-        ("ns_per_sample", "gradient-rays", "ns, along rays ÷ first", "time"),
-        ("ns_per_sample", "gradient-random", "ns, at random ÷ first", "time"),
-    )
+    first = config.variants[0].name
     with plots.settings():
-        figure = plots.canvas(10.8, 3.9)
-        for axes, (quantity, work, title, kind) in zip(figure.subplots(1, 4), panels, strict=True):
-            found = _points(config, records, index, n, work)
-            for recipe in config.methods:
-                own = {r["variant"]: r for r in found.values() if _of(r, recipe.record())}
-                first = _number(own.get(names[0]), quantity)
-                if first and recipe.prefilter and recipe.record()["default_gradient"]:
-                    y = [(_number(own.get(v), quantity) or float("nan")) / first for v in names]
-                    axes.plot(range(len(names)), y, label=label(recipe.record()), **line_style(recipe.record()))
-            axes.set_xticks(range(len(names)), names, rotation=50, ha="right")
-            axes.set_title(title, fontsize=9)
-            if kind == "error":
+        figure = plots.canvas(10.8, 3.3 * len(sources) + 0.5)
+        for i, row in zip(sources, figure.subplots(len(sources), 3, squeeze=False), strict=True):
+            signal = config.sources[i].signal.name
+            for axes, (error, work, quantity) in zip(row, QUANTITIES, strict=False):
+                _precisions(axes, config, _points(config, records, i, n, work), error, names)
+                axes.set_title(f"{signal}: error of the {quantity} ÷ {first}", fontsize=9)
                 plots.logarithmic(axes)
-            else:
-                axes.set_ylim(bottom=0)
-        handles, labels = axes.get_legend_handles_labels()
+            work, where = TIMES[min(i, len(TIMES) - 1)]
+            _precisions(row[-1], config, _points(config, records, i, n, work), "ns_per_sample", names)
+            row[-1].set_title(f"time, points {where} ÷ {first}", fontsize=9)
+            row[-1].set_ylim(bottom=0)
+        handles, labels = row[-1].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=7, frameon=False)
-        drawn = plots.svg(figure, f"precision-{index}")
+        drawn = plots.svg(figure, "precision")
     caption = (
-        f"{config.sources[index].signal.label} at {n}³: error and time per value and gradient in units of "
-        f"{names[0]}. The better a method, the more it loses by rounding."
+        f"RMS errors, and time per value and gradient, at {n}³ in units of {first}. The better a method, the more it "
+        "loses by rounding. Integers are spread over the range of the coefficients, and so have smaller steps than "
+        "floating point numbers of as many bits."
     )
     return Plot(drawn, caption)
+
+
+TIMES = (("gradient-rays", "along rays"), ("gradient-random", "at random"))
+BITS = {"float64": 64, "float32": 32, "int16": 16, "float16": 16, "bfloat16": 16, "uint8": 8, "int8": 8}
+
+
+def _bits(variant: Variant) -> tuple[int, int]:
+    """Long before short, and of 16 bits the type with the finest steps first."""
+    name = variant.storage or variant.dtype
+    return -BITS[name], list(BITS).index(name)
+
+
+def _precisions(axes: Axes, config: Config, found: Mapping[str, Record], quantity: str, names: Sequence[str]) -> None:
+    """A curve over the variants for every prefiltered method with its own gradient, in units of the first variant."""
+    for recipe in config.methods:
+        own = {r["variant"]: r for r in found.values() if same_method(r, recipe.record())}
+        unit = _number(own.get(config.variants[0].name), quantity)
+        if unit and recipe.prefilter and recipe.record()["default_gradient"]:
+            y = [(_number(own.get(v), quantity) or float("nan")) / unit for v in names]
+            axes.plot(range(len(names)), y, label=label(recipe.record()), **line_style(recipe.record()))
+    axes.set_xticks(range(len(names)), names, rotation=35, ha="right")
 
 
 def _number(record: Record | None, quantity: str) -> float | None:

@@ -25,7 +25,7 @@ from torch.utils.checkpoint import checkpoint
 from filterlab.fields.base import Domain, Field
 from filterlab.fields.grid import GridField
 from filterlab.render.camera import Camera, check_size
-from filterlab.render.fused import FusedMarcher, can_be_fused
+from filterlab.render.fused import FusedMarcher, why_not_fused
 from filterlab.render.plain import Chords, Marcher, Medium, PlainMarcher, rays_at_once
 from filterlab.render.rays import Region, check_rays, check_region, intersect, jitter, segment_count
 from filterlab.render.shading import Shading
@@ -110,6 +110,43 @@ def render(
     Source: Max, Optical models for direct volume rendering, 1995; step and opacity as in Engel et al., Real-Time Volume
     Graphics, 2006.
     """
+    job = prepare(
+        field,
+        camera,
+        transfer,
+        size=size,
+        step=step,
+        shading=shading,
+        background=background,
+        region=region,
+        jitter_seed=jitter_seed,
+        termination=termination,
+        dtype=dtype,
+        device=device,
+        max_samples=max_samples,
+        memory=memory,
+    )
+    return job.run(progress)
+
+
+def prepare(
+    field: Field,
+    camera: Camera | Rays,
+    transfer: TransferFunction,
+    *,
+    size: Sequence[int] | None = None,
+    step: float = 0.5,
+    shading: Shading | None = None,
+    background: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
+    region: Region | None = None,
+    jitter_seed: int | None = None,
+    termination: float | None = None,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str | None = None,
+    max_samples: int = 2**34,
+    memory: int = 2**28,
+) -> Job:
+    """All that `render` decides before it marches; arguments and errors are those of `render`."""
     _check_arguments(field, camera, transfer, shading, step, termination, dtype, max_samples, memory)
     device = torch.device(device or _device_of(camera, transfer))
     view = _View.of(camera, size, device)
@@ -136,21 +173,57 @@ def render(
         if len(view.pixels) * _BYTES_PER_RAY <= memory:  # else rays are cut again for every image
             parts = [cut(view, pixels) for pixels in parts]
         total = cut.count_all(view, parts, len(media), max_samples)
-        with _reporting(progress, total) as report:
+    return Job(media, marcher, view, cut, parts, total, color, field.channels)
+
+
+@dataclass(frozen=True)
+class Job:
+    """An image that is ready to be marched.
+
+    Attributes:
+        media: what is marched through, one for every image of a batch.
+        marcher: what marches.
+        samples: how many segments all rays have together, before any is skipped or left out behind what is opaque.
+    """
+
+    media: list[Medium]
+    marcher: Marcher
+    _view: _View
+    _cut: _Cut
+    _parts: Sequence[Tensor | Chords]
+    samples: int
+    _background: Tensor
+    _channels: tuple[int, int] | None
+
+    @property
+    def pixels(self) -> int:
+        """Rays of one image."""
+        return len(self._view.pixels)
+
+    def chords(self, pixels: Tensor) -> Chords:
+        """The rays of some pixels, cut into segments."""
+        return self._cut(self._view, pixels)
+
+    def run(self, progress: Progress = False) -> Tensor:
+        """The image, as `render` gives it."""
+        with (
+            torch.set_grad_enabled(self.media[0].differentiable),
+            _reporting(progress, self.samples) as report,
+        ):
             done, tiles = 0, []
-            for medium in media:
-                for part in parts:
-                    chords = part if isinstance(part, Chords) else cut(view, part)
-                    light, depth = marcher.march(medium, chords, lambda n, done=done: report(done + n))
+            for medium in self.media:
+                for part in self._parts:
+                    chords = part if isinstance(part, Chords) else self.chords(part)
+                    light, depth = self.marcher.march(medium, chords, lambda n, done=done: report(done + n))
                     done += int(chords.count.sum())  # with those that early termination saved
-                    tiles.append(_over(light, depth[:, None], color))
-            report(total)
-    return torch.cat(tiles).reshape(*(field.channels or ()), *view.shape, 4)
+                    tiles.append(_over(light, depth[:, None], self._background))
+            report(self.samples)
+        return torch.cat(tiles).reshape(*(self._channels or ()), *self._view.shape, 4)
 
 
 def _marcher(medium: Medium, memory: int) -> tuple[Marcher, int]:
     """The fused marcher where it can run as asked, else the plain one; and how many rays go to it at a time."""
-    if can_be_fused(medium):
+    if why_not_fused(medium) is None:
         if medium.differentiable:  # derivatives by the volume are a volume for every tile
             return FusedMarcher(memory), max(memory // _BYTES_PER_RAY_SAVED, 1)
         return FusedMarcher(memory), max(min(memory // _BYTES_PER_RAY, _TILE), 1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -28,37 +28,39 @@ SKIPPING = True
 """Whether empty space is left out; it changes no bit of the image."""
 
 
-def can_be_fused(medium: Medium) -> bool:
-    """Whether the fused marcher can run as asked: a field of scheme "fused", no transforms of torch.func.
+def why_not_fused(medium: Medium) -> str | None:
+    """What keeps the fused marcher from running as asked; None: nothing.
 
-    On a GPU derivatives are sums of atomic additions, in whatever order they come. Where torch is told to be
-    deterministic (when the image is rendered) they are the plain marcher's.
+    It takes fields of scheme "fused", and no transforms of torch.func. On a GPU derivatives are sums of atomic
+    additions, in whatever order they come: where torch is told to be deterministic (when the image is rendered) they
+    are the plain marcher's.
     """
     field = medium.field
     if not isinstance(field, GridField) or not isinstance(field.scheme, Direct) or field.scheme.name != "fused":
-        return False
+        scheme = f"scheme {field.scheme.name!r}" if isinstance(field, GridField) else f"a {type(field).__name__}"
+        return f"it marches fields of scheme 'fused'; this is {scheme}"
     if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
-        return False
+        return "it has no transforms of torch.func"
     values, start = field.coefficients.values, field.coefficients.start
     if medium.transfer.positions.device != values.device:
-        return False
+        return f"coefficients are on {values.device}, rays on {medium.transfer.positions.device}"
     if medium.differentiable and march.on_gpu(values) and torch.are_deterministic_algorithms_enabled():
-        return False
-    if bool((_of_stored(medium).positions.detach().diff() <= 0).any()):  # rounded to one number
-        return False
+        return "its derivatives on a GPU are not deterministic, as torch is told to be"
+    if bool((_of_stored(medium).positions.detach().diff() <= 0).any()):
+        return "control points fall together when they are rounded to how coefficients are stored"
     lights = len(medium.shading.lights) if medium.shading else 0
-    return march.missing(values[(0,) * (values.ndim - 3)], _stencil(medium), start, medium.dtype, lights) is None
+    return march.missing(values[(0,) * (values.ndim - 3)], _stencil(medium), start, medium.dtype, lights)
 
 
 def _stencil(medium: Medium) -> Stencil:
     field = medium.field
     assert isinstance(field, GridField)
     assert isinstance(field.scheme, Direct)
-    return field.scheme.stencils[0 if medium.shading is None else 1]
+    return field.scheme.stencils[medium.order]
 
 
 class FusedMarcher:
-    """Fields for which `can_be_fused` holds.
+    """Fields for which `why_not_fused` has no answer.
 
     Args:
         memory: bytes that samples of the plain marcher may take, which computes second derivatives.
@@ -96,6 +98,31 @@ def _empty_parts(medium: Medium) -> Bricks | None:
         return None
     assert isinstance(medium.field, GridField)
     return bricks_of(medium.field.coefficients.values, _stencil(medium), _of_stored(medium))
+
+
+@dataclass(frozen=True)
+class EmptyBricks:
+    """The bricks that a medium has no opacity in, and where points of the world belong among them."""
+
+    bricks: Bricks
+    field: GridField
+    supports: tuple[int, int, int]
+
+    def empty(self, points: Tensor) -> Tensor:
+        """Whether each point `(S, 3)` within the domain lies in an empty brick."""
+        located = self.field.domain.geometry.to_voxel(points) - self.field.coefficients.shift
+        first = located - located.new_tensor([s / 2 - 1 for s in self.supports])
+        sizes = torch.tensor(self.bricks.distance.shape[::-1], device=points.device)
+        brick = (first.floor().long() - self.field.coefficients.start) >> self.bricks.edge
+        x, y, z = brick.clamp_min(0).minimum(sizes - 1).unbind(-1)
+        return self.bricks.distance[z, y, x] > 0
+
+
+def empty_bricks(medium: Medium) -> EmptyBricks | None:
+    """Those of a medium that the fused marcher can march; None: there are none."""
+    found = _empty_parts(medium)
+    assert isinstance(medium.field, GridField)
+    return None if found is None else EmptyBricks(found, medium.field, _stencil(medium).supports)
 
 
 def _of_stored(medium: Medium) -> TransferFunction:

@@ -78,6 +78,11 @@ class Medium:
     def dtype(self) -> torch.dtype:
         return self.transfer.positions.dtype
 
+    @property
+    def order(self) -> int:
+        """The highest derivative of the field that is asked for: none without light."""
+        return 0 if self.shading is None else 1
+
 
 class Marcher(Protocol):
     """Marches tiles of rays through a medium."""
@@ -162,7 +167,7 @@ def _block(medium: Medium, chords: Chords, depth: Tensor, first: int) -> tuple[T
     # gradients come in one pass with values when nearly every sample needs one: when derivatives are asked, or when no
     # value is transparent
     one_pass = shading is not None and (medium.differentiable or not transfer.transparent_somewhere)
-    jet = medium.field.jet(points, 1 if one_pass else 0)
+    jet = medium.field.jet(points, medium.order if one_pass else 0)
     located = transfer.locate(jet[0])
     tau = transfer.optical_depth(transfer.opacity(located), thickness)
     weight, after = _compose(_spread(tau, kept, real.shape), depth, medium.faint)

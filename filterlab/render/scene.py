@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,6 +22,7 @@ import torch
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 from torch import Tensor
 
+from filterlab import recommendation_report as report
 from filterlab import signals
 from filterlab.fields.base import Domain
 from filterlab.fields.base import Field as FilterlabField
@@ -27,6 +30,7 @@ from filterlab.io.bounded import VolumeFileError
 from filterlab.io.config import StrictModel, load_config, unknown_name
 from filterlab.io.volumes import describe, load_volume
 from filterlab.methods import METHODS, reconstruct
+from filterlab.recommendation import recommend
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
 from filterlab.render.dvr import Progress, render
 from filterlab.render.rays import check_region
@@ -35,6 +39,8 @@ from filterlab.render.transfer import TransferFunction
 from filterlab.volume import Boundary, Volume
 
 VOLUMES_VARIABLE = "FILTERLAB_VOLUMES"
+AUTO = "auto"
+STEP = 0.5  # voxels
 
 Vector = tuple[float, float, float]
 Component = Annotated[float, Field(ge=0)]
@@ -45,9 +51,19 @@ Pixels = Annotated[int, Field(ge=1, le=2**15)]
 
 
 def _known_method(name: str) -> str:
-    if name not in METHODS:
-        raise ValueError(unknown_name("method", name, METHODS))
+    if name not in (*METHODS, AUTO):
+        raise ValueError(unknown_name("method", name, (*METHODS, AUTO)))
     return name
+
+
+def _part(value: Any) -> Any:
+    """A part as a number, or as a text like `0.5%`."""
+    if not isinstance(value, str):
+        return value
+    number = value.removesuffix("%").strip()
+    if number == value or not re.fullmatch(r"[0-9]*\.?[0-9]+(e-?[0-9]+)?", number):
+        raise ValueError(f"expected a part like 0.005 or 0.5%; got {value!r}")
+    return float(number) / 100
 
 
 def _known_signal(name: str) -> str:
@@ -177,9 +193,16 @@ def _check_parameters(name: str, parameters: Parameters) -> None:
 
 
 class Reconstruction(StrictModel):
-    """How samples become a field; a bare name stands for a method as it is. See `filterlab.reconstruct`."""
+    """How samples become a field; a bare name stands for a method as it is. See `filterlab.reconstruct`.
+
+    Attributes:
+        name: of a method, or `auto`: the cheapest one whose error on this volume stays within a budget, with the
+            scheme, storage and (unless the scene has one) step that `filterlab.recommend` finds for task "dvr".
+        max_error: that budget, in parts of the range of the volume's values; only with `auto`.
+    """
 
     name: Annotated[str, AfterValidator(_known_method)] = "triquadratic"
+    max_error: Annotated[float, BeforeValidator(_part), Field(gt=0)] | None = None
     prefilter: bool = True
     scheme: str | None = None
     boundary: Annotated[str, AfterValidator(_known_boundary)] = "mirror"
@@ -195,6 +218,13 @@ class Reconstruction(StrictModel):
 
     @model_validator(mode="after")
     def _offered(self) -> Reconstruction:
+        if (self.name == AUTO) != (self.max_error is not None):
+            raise ValueError(f"max_error goes with the name {AUTO}, and only with that; got {self.name}")
+        if self.name == AUTO:
+            settled = {"prefilter", "scheme", "gradient", "sampler", "storage"} & self.model_fields_set
+            if settled:
+                raise ValueError(f"{AUTO} settles {', '.join(sorted(settled))}; leave it out, or name a method")
+            return self
         METHODS[self.name].scheme(self.scheme, self.gradient, self.sampler)
         return self
 
@@ -374,7 +404,7 @@ class Scene(StrictModel):
         method: how samples are reconstructed; default triquadratic.
         transfer, camera, lighting, region: see there; without lighting colours are shown as they are.
         size: (width, height) in pixels.
-        step: in voxels.
+        step: in voxels; default half a voxel, or what `method: auto` finds.
         background: linear RGB.
         jitter: a seed; see `render`.
         termination: see `render`.
@@ -389,7 +419,7 @@ class Scene(StrictModel):
     transfer: Transfer
     camera: View = View()
     size: tuple[Pixels, Pixels] = (512, 512)
-    step: Positive = 0.5
+    step: Positive | None = None
     lighting: Lighting | None = None
     background: Color = (0.0, 0.0, 0.0)
     region: Region | None = None
@@ -406,15 +436,29 @@ class Scene(StrictModel):
             raise ValueError("a signal that is not sampled needs no method: give signal.samples, or leave method out")
         return self
 
+    @property
+    def step_or_default(self) -> float:
+        """In voxels."""
+        return STEP if self.step is None else self.step
+
 
 @dataclass(frozen=True)
 class Prepared:
-    """A scene with everything built: what `render` takes."""
+    """A scene with everything built: what `render` takes.
 
+    Attributes:
+        scene: with `method: auto` replaced by what was found.
+        volume_bytes: of the samples; 0 for a signal that is not sampled.
+        chosen: how `method: auto` came to its choice, in sentences; else nothing.
+    """
+
+    scene: Scene
     field: FilterlabField
     camera: Camera
     transfer: TransferFunction
     options: dict[str, Any]
+    volume_bytes: int = 0
+    chosen: tuple[str, ...] = ()
 
     def render(self, progress: Progress = False) -> Tensor:
         """The image `(H, W, 4)`, as `filterlab.render.render` gives it."""
@@ -432,22 +476,33 @@ def load_scene(path: str | os.PathLike[str], overrides: Mapping[str, str] | None
 
 
 def build(scene: Scene) -> Prepared:
-    """Loads or samples what the scene shows, reconstructs it and builds camera, transfer function and lights."""
-    dtype = torch.float64 if scene.precision == "float64" else torch.float32
-    field, value_range = _source(scene, dtype)
+    """Loads or samples what the scene shows, reconstructs it and builds camera, transfer function and lights.
+
+    Raises ValueError where `method: auto` finds nothing within its budget, with the best there is.
+    """
+    volume = _volume(scene)
+    scene, chosen = settled(scene, volume)
+    if volume is None:
+        assert scene.signal is not None
+        signal = scene.signal.build()
+        field, value_range = signal, lambda: _range(signal.sample(64).samples)
+    else:
+        field = (scene.method or Reconstruction()).build(volume)
+        value_range = partial(_range, volume.samples)
     options = {
         "size": scene.size,
-        "step": scene.step,
+        "step": scene.step_or_default,
         "shading": scene.lighting.build() if scene.lighting else None,
         "background": scene.background,
         "region": scene.region.build() if scene.region else None,
         "jitter_seed": scene.jitter,
         "termination": scene.termination,
-        "dtype": dtype,
+        "dtype": torch.float64 if scene.precision == "float64" else torch.float32,
         "device": scene.device,
     }
     transfer = scene.transfer.build(value_range, field.domain.voxel_size)
-    return Prepared(field, scene.camera.build(field.domain, scene.size), transfer, options)
+    camera = scene.camera.build(field.domain, scene.size)
+    return Prepared(scene, field, camera, transfer, options, 0 if volume is None else volume.samples.nbytes, chosen)
 
 
 def render_scene(scene: Scene, progress: Progress = False) -> Tensor:
@@ -459,21 +514,39 @@ def render_scene(scene: Scene, progress: Progress = False) -> Tensor:
         return build(scene).render(progress)[..., :3]
 
 
-def _source(scene: Scene, dtype: torch.dtype) -> tuple[FilterlabField, Callable[[], tuple[float, float]]]:
-    """What is shown, and a function for the range of its samples."""
+def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]]:
+    """The scene with `method: auto` replaced by what is found on the volume, and how, in sentences."""
+    method = scene.method
+    if volume is None or method is None or method.max_error is None:
+        return scene, ()
+    found = recommend(volume, method.max_error, task="dvr", boundary=method.boundary, nan=method.nan)
+    if found.pick is None:
+        best = report.sentences(found)[-1].removeprefix("The ").removesuffix(".")
+        raise ValueError(f"method: found none within max_error {report.percent(method.max_error)}; the {best}")
+    explicit = Reconstruction(
+        name=found.pick.method,
+        scheme=found.pick.scheme,
+        storage=found.pick.storage,  # type: ignore[arg-type]
+        boundary=method.boundary,
+        nan=method.nan,
+    )
+    step = found.pick.step if scene.step is None else scene.step
+    return scene.model_copy(update={"method": explicit, "step": step}), tuple(report.sentences(found))
+
+
+def _volume(scene: Scene) -> Volume | None:
+    """The samples, in the type and on the device of the scene; None for a signal that is shown as it is."""
+    dtype = torch.float64 if scene.precision == "float64" else torch.float32
     if scene.volume is not None:
         volume = scene.volume.load()
     else:
         assert scene.signal is not None
-        signal = scene.signal.build()
         if scene.signal.samples is None:
-            return signal, lambda: _range(signal.sample(64).samples)
-        volume = signal.sample(scene.signal.samples, dtype=dtype)
+            return None
+        volume = scene.signal.build().sample(scene.signal.samples, dtype=dtype)
     if dtype == torch.float64 or volume.dtype == torch.float64:
         volume = volume.to(dtype)
-    volume = volume.to(scene.device)
-    method = scene.method or Reconstruction()
-    return method.build(volume), lambda: _range(volume.samples)
+    return volume.to(scene.device)
 
 
 def _range(samples: Tensor) -> tuple[float, float]:

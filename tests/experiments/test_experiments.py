@@ -142,6 +142,15 @@ def tiny(name, scan):
         "image_seconds": 0,
         "finest": 32,
     }
+    configs["recommend_validation"] = {
+        "signals": [{"signal": "gaussian", "resolutions": [16]}],
+        "waves": [{"bandwidths": [0.5], "resolution": 16}],
+        "scans": [str(scan), {"file": "not_here.nrrd", "optional": True}],
+        "tasks": ["resample", "isosurface"],
+        "budgets": [0.05],
+        "points": 200,
+        "seconds": 0.01,
+    }
     configs["stability"] = {"methods": ["trilinear"], "cases": ["nan-coordinate"], "amount": 0.02}
     parts = {n: {"experiment": n, "description": f"tiny {n}", **c} for n, c in configs.items()}
     parts["demo"] = {"experiment": "demo", "description": "tiny", "sections": [parts["rms_error"], parts["dvr_volume"]]}

@@ -215,7 +215,8 @@ def test_a_voxel_of_nan_is_seen_by_rays_near_it_and_changes_no_other(
     torn[voxel] = math.nan
     scene = {"transfer": medium(0.05), "step": step, **along(11.0, count=10)}
     whole, image = (
-        render(reconstruct(v, "triquadratic", prefilter=False, scheme=scheme), **scene) for v in (samples, torn)
+        render(reconstruct(v, "triquadratic", prefilter=False, scheme=scheme, nan="propagate"), **scene)
+        for v in (samples, torn)
     )
     wrong = image.isnan()
     assert torch.equal(wrong.all(-1), wrong.any(-1))

@@ -1,8 +1,9 @@
 """gather and scatter in Triton: one program per stencil, compiled for the GPU at its first use.
 
 `taps` writes the sums (read it first), `points` the programs around them, `march` and `adjoint` those of the renderer;
-`launch` hands their text to Triton, which keeps what it has compiled on disk. With TRITON_INTERPRET=1 in the environment the same programs run on tensors of the
-CPU, in Triton's interpreter: slowly, to test them where there is no GPU.
+`launch` hands their text to Triton, which keeps what it has compiled on disk. With TRITON_INTERPRET=1 in the
+environment the same programs run on tensors of the CPU, in Triton's interpreter: slowly, to test them where there is no
+GPU.
 
 Same meaning as `ops.reference`, orders 0 … 3. Coefficients are read as they are stored, sums are in the points' dtype.
 gather repeats itself bit by bit. scatter adds atomically, in whatever order the GPU comes by, and repeats itself up to

@@ -1,0 +1,44 @@
+"""A plan as people read it."""
+
+from __future__ import annotations
+
+from rich.table import Table
+from rich.text import Text
+
+from filterlab.recommendation_report import duration, percent, size
+from filterlab.render.plan import Plan
+
+
+def table(plan: Plan) -> Table:
+    """One line for every decision."""
+    shown = Table(show_header=False, box=None)
+    for name, text in _lines(plan):
+        shown.add_row(name, Text(text))
+    return shown
+
+
+def _lines(plan: Plan) -> list[tuple[str, str]]:
+    taps = "" if plan.taps is None else f", {plan.taps} taps"
+    lines = [("method", f"{plan.method} ({plan.scheme}), coefficients as {plan.storage}{taps}")]
+    lines += [("" if i else "chosen", sentence) for i, sentence in enumerate(plan.chosen)]
+    lines.append(("asked of it", plan.derivatives))
+    marcher = "fused: one program, compiled for this processor" if plan.marcher == "fused" else "plain: torch"
+    lines.append(("marcher", marcher + (f" ({plan.not_fused})" if plan.not_fused else "")))
+    lines.append(("rays", f"{plan.rays:,}"))
+    lines.append(("samples", f"{plan.samples:,} at a step of {plan.step:g} voxels"))
+    lines.append(("empty space", _skipping(plan)))
+    sizes = (("volume", plan.volume_bytes), ("coefficients", plan.coefficient_bytes), ("image", plan.image_bytes))
+    lines.append(("memory", ", ".join(f"{name} {size(count)}" for name, count in sizes if count)))
+    time = plan.seconds
+    spread = f"{duration(time.low)} … {duration(time.high)}"
+    lines.append(("time", f"about {duration(time.median)} to march ({spread}, from a small part of the rays)"))
+    lines += [("" if i else "not computed", text) for i, text in enumerate(plan.absent)]
+    return lines
+
+
+def _skipping(plan: Plan) -> str:
+    if plan.empty_bricks is None or plan.skipped is None:
+        return "not looked for: the plain marcher takes every sample"
+    if not plan.empty_bricks:
+        return "none: every brick of the volume may have some opacity"
+    return f"{percent(plan.empty_bricks)} of the bricks; about {percent(plan.skipped)} of the samples lie in them"

@@ -1,0 +1,175 @@
+"""Plans: what a scene takes, from the job that renders it; and `method: auto`, which is settled first."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from filterlab.cli import main
+from filterlab.fields.base import Field
+from filterlab.io.config import ConfigError, loads_config
+from filterlab.render import scene as scenes
+from filterlab.render.dvr import prepare
+from filterlab.render.plan import plan
+from filterlab.render.plan_report import table
+from filterlab.render.scene import Prepared, Scene, build
+
+BASE = """
+signal: {name: sphere, samples: 24}
+method: triquadratic
+transfer: {unit: 0.1, points: [
+  {value: 0.2, color: [1, 0.5, 0.2], opacity: 0},
+  {value: 0.7, color: [1, 0.9, 0.2], opacity: 0.5}]}
+size: [20, 16]
+"""
+
+
+def scene(more: str = "") -> Scene:
+    return loads_config(BASE + more, Scene)
+
+
+class Counting(Field):
+    """A field that notes how often it is asked, and for which derivatives."""
+
+    def __init__(self, field: Field) -> None:
+        self.field, self.domain, self.max_order = field, field.domain, field.max_order
+        self.samples, self.orders = 0, set()
+
+    def jet(self, points: torch.Tensor, order: int) -> tuple[torch.Tensor, ...]:
+        if order == 0 or not self.orders:
+            self.samples += points.shape[:-1].numel()
+        self.orders.add(order)
+        return self.field.jet(points, order)
+
+
+@pytest.mark.parametrize(
+    "more", ["", "lighting: {}\n", "jitter: 3\nstep: 1.3\n", "region: {lower: [-1, -1, -1], upper: [0, 1, 1]}\n"]
+)
+def test_a_plan_says_what_the_renderer_does(more: str) -> None:
+    """The plain marcher, which skips nothing, takes as many samples, and asks for no other derivatives."""
+    prepared = build(scene(more))
+    found = plan(prepared)
+    counting = Counting(prepared.field)
+    other = Prepared(prepared.scene, counting, prepared.camera, prepared.transfer, prepared.options)
+    with torch.no_grad():
+        other.render()
+        told = []
+        prepared.render(lambda done, total: told.append(total))
+    assert found.samples == counting.samples == told[-1]
+    assert found.order == max(counting.orders)
+    assert found.rays == 20 * 16
+    assert found.marcher == "fused"
+    assert plan(other).marcher == "plain"
+    assert "a Counting" in str(plan(other).not_fused)
+    assert plan(other).skipped is None
+
+
+def test_what_is_skipped_is_what_the_renderer_leaves_out() -> None:
+    """Samples in empty bricks, counted one by one over all rays."""
+    text = BASE.replace("samples: 24", "samples: 40, parameters: {radius: 0.3, edge: 0.05}")
+    prepared = build(loads_config(text, Scene))
+    found = plan(prepared)
+    assert found.empty_bricks is not None
+    assert found.skipped is not None
+    assert 0.3 < found.empty_bricks < 1
+    assert 0.3 < found.skipped < 1
+    from filterlab.render.fused import empty_bricks
+
+    job = prepare(prepared.field, prepared.camera, prepared.transfer, **prepared.options)
+    bricks = empty_bricks(job.media[0])
+    assert bricks is not None
+    inside = 2 * torch.rand(4000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 1
+    lying = inside[bricks.empty(inside)]
+    values = prepared.field(lying)
+    assert len(lying) > 1000
+    assert float(prepared.transfer.opacity(prepared.transfer.locate(values.double())).max()) == 0
+
+
+def test_a_volume_without_empty_space_has_none_to_skip() -> None:
+    opaque = BASE.replace("opacity: 0}", "opacity: 0.1}")
+    found = plan(build(loads_config(opaque, Scene)))
+    assert found.empty_bricks == found.skipped == 0
+
+
+def test_what_is_absent_is_listed_and_what_is_there_is_not() -> None:
+    bare = " ".join(plan(build(scene())).absent)
+    for word in ("lighting", "region", "jitter", "termination"):
+        assert word in bare
+    full = scene("lighting: {}\njitter: 1\ntermination: 0.01\nregion: {lower: [-1, -1, -1], upper: [1, 1, 1]}\n")
+    assert plan(build(full)).absent == ()
+
+
+def test_a_signal_is_planned_too() -> None:
+    text = BASE.replace(", samples: 24", "").replace("method: triquadratic", "")
+    found = plan(build(loads_config(text, Scene)))
+    assert (found.method, found.taps, found.volume_bytes, found.coefficient_bytes) == ("exact", None, 0, 0)
+    assert found.marcher == "plain"
+    assert table(found).row_count > 5
+
+
+# --- method: auto -----------------------------------------------------------------------------------------------------
+
+AUTO = BASE.replace("method: triquadratic", "method: {name: auto, max_error: 60%}")
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Costs are measured for less long, and of fewer methods."""
+    whole = scenes.recommend
+
+    def recommend(*arguments, **options):
+        return whole(*arguments, methods=["trilinear", "notch"], seconds=0.05, **options)
+
+    monkeypatch.setattr(scenes, "recommend", recommend)
+
+
+def test_auto_is_the_scene_that_it_stands_for() -> None:
+    prepared = build(loads_config(AUTO, Scene))
+    method = prepared.scene.method
+    assert method is not None
+    assert method.name in ("trilinear", "notch")
+    assert method.max_error is None
+    assert prepared.scene.step == prepared.options["step"] == 1.0
+    with torch.no_grad():
+        assert torch.equal(prepared.render(), build(prepared.scene).render())
+    assert any("Recommended" in sentence for sentence in plan(prepared).chosen)
+
+
+def test_a_step_of_the_scene_is_kept() -> None:
+    assert build(loads_config(AUTO + "step: 0.3\n", Scene)).options["step"] == 0.3
+
+
+def test_auto_says_when_nothing_is_within_the_budget() -> None:
+    text = AUTO.replace("60%", "0.000001")
+    with pytest.raises(ValueError, match=r"found none within max_error 0.0001 %; the most accurate: "):
+        build(loads_config(text, Scene))
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        ("auto", "max_error goes with the name auto"),
+        ("{name: notch, max_error: 0.1}", "max_error goes with the name auto"),
+        ("{name: auto, max_error: 1%, scheme: direct}", "auto settles scheme"),
+        ("{name: auto, max_error: lots}", "a part like 0.005 or 0.5%; got 'lots'"),
+        ("{name: auto, max_error: 0}", "greater than 0"),
+        ("{name: autop, max_error: 1%}", "did you mean 'auto'?"),
+    ],
+)
+def test_mistakes(method: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        loads_config(BASE.replace("method: triquadratic", f"method: {method}"), Scene)
+
+
+def test_the_command(tmp_path, capsys) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(BASE)
+    assert main(["render", str(path), "--explain", "--step", "0.25"]) == 0
+    shown = capsys.readouterr().out
+    assert "triquadratic (fused)" in shown
+    assert "at a step of 0.25 voxels" in shown
+    assert "lighting: no gradient is computed" in shown
+    assert main(["render", str(path)]) == 2
+    assert main(["render", str(path), "--explain", "-o", str(tmp_path / "p.png")]) == 2
+    assert "expected either -o FILE.png or --explain; got both" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [path]
