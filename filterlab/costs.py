@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -116,14 +115,15 @@ def measure(
             of each candidate by its name, to compare precisions (float64 points are computed in float64) or devices.
             Their order in space counts: points along rays read memory that is near, random ones do not.
         order: of the jets that are timed: 0 values, 1 values and gradients, 2 Hessians too.
-        seconds: about how long it may take. Where that does not suffice for three rounds it takes longer; first calls,
-            which compile and load, are not counted and come on top.
+        seconds: about how long it may take, half of it for building and half for sampling. Where that does not suffice
+            for three rounds it takes longer; first calls, which compile and load, are not counted and come
+            on top.
         clock: default: `time.perf_counter`. `time.process_time` does not see the time in which the core worked for
             others; it adds up all threads.
         tick: told which fraction is done.
 
-    Fields are built anew in every round: where their memory happens to lie would else decide all rounds alike (seen:
-    a factor of three). One is kept while the next is built; memory is that of two.
+    All fields are kept until the end: memory is the sum of their coefficients, and of one more while they are built.
+    (Building them anew in every round was tried: fresh memory is slower, and not for all alike.)
 
     Returns:
         name -> `Cost`, in the order of the candidates.
@@ -135,35 +135,26 @@ def measure(
     for name, p in where.items():
         if p.numel() == 0:
             raise ValueError(f"expected points (P, 3) with P ≥ 1 to sample {name} at; got shape {tuple(p.shape)}")
-    held: list[Field] = []  # the field that was built last: each is sampled before the next one is built
-
-    def built(name: str) -> Field:
-        field = candidates[name]()
-        held[:] = [field]
-        return field
-
-    def sampled(name: str) -> tuple[Tensor, ...]:
-        return held[0].jet(where[name], order)
-
-    calls, sizes = {}, {}
     with torch.no_grad():
-        for name, p in where.items():
-            calls[f"build {name}"] = _finished(partial(built, name), p.device)
-            calls[f"sample {name}"] = _finished(partial(sampled, name), p.device)
-            sizes[name] = coefficient_bytes(calls[f"build {name}"]())
-            calls[f"sample {name}"]()
-        rounds = take_turns(calls, seconds=seconds, clock=clock, tick=tick)
+        builds = {name: _finished(build, where[name].device) for name, build in candidates.items()}
+        fields = {name: build() for name, build in builds.items()}
+        jets = {name: _finished(_jet(f, where[name], order), where[name].device) for name, f in fields.items()}
+        for jet in jets.values():
+            jet()
+        building = take_turns(builds, seconds=seconds / 2, clock=clock, tick=lambda done: tick(done / 2))
+        sampling = take_turns(jets, seconds=seconds / 2, clock=clock, tick=lambda done: tick((1 + done) / 2))
     return {
-        name: _cost(
-            sizes[name],
-            rounds.seconds[f"build {name}"],
-            [3e9 * s / p.numel() for s in rounds.seconds[f"sample {name}"]],
-        )
-        for name, p in where.items()
+        name: _cost(field, building.seconds[name], [3e9 * s / where[name].numel() for s in sampling.seconds[name]])
+        for name, field in fields.items()
     }
 
 
-def _cost(size: int, building: Sequence[float], nanoseconds: Sequence[float]) -> Cost:
+def _jet(field: Field, points: Tensor, order: int) -> Callable[[], Any]:
+    return lambda: field.jet(points, order)
+
+
+def _cost(field: Field, building: Sequence[float], nanoseconds: Sequence[float]) -> Cost:
+    size = coefficient_bytes(field)
     return Cost(Quartiles.of(building), Quartiles.of(nanoseconds), size, tuple(nanoseconds))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import weakref
 from types import SimpleNamespace
 
 import pytest
@@ -156,23 +155,6 @@ def test_a_slow_first_call_is_not_taken_for_the_usual_one(monkeypatch):
     found = measure({"A": lambda: field}, torch.rand(100, 3), seconds=1e3)
     assert len(found["A"].rounds) == costs.ROUNDS
     assert len(field.asked) > 40 * costs.ROUNDS
-
-
-def test_fields_are_built_anew_in_every_round_and_one_is_held_at_a_time(monkeypatch):
-    """Where the memory of a field happens to lie may make it slow: not in all rounds alike."""
-    clock, alive = Clock(monkeypatch), []
-
-    def build(name):
-        clock.now += 1.0
-        field = Counting(clock)
-        field.name = name
-        alive.append(weakref.ref(field))
-        assert sum(ref() is not None for ref in alive) <= 2
-        return field
-
-    found = measure({name: lambda name=name: build(name) for name in "AB"}, torch.rand(10, 3), seconds=1e-9)
-    assert len(alive) == 2 * (1 + 1 + costs.LEAST_ROUNDS), "a first time, once to see how long it takes, and in rounds"
-    assert all(c.build.median == 1 and c.sample.median == pytest.approx(1000) for c in found.values())
 
 
 def test_every_candidate_is_sampled_at_its_own_field(monkeypatch):
