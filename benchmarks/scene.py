@@ -17,6 +17,7 @@ from filterlab import signals
 from filterlab.fields.base import Field
 from filterlab.methods import reconstruct
 from filterlab.render import PerspectiveCamera, Shading, TransferFunction, render
+from filterlab.render.dvr import prepare
 
 DIRECTION = (0.62, 0.77, -0.5)
 FIELD_OF_VIEW = 18.0  # degrees; with 30 the corners of the volume touch the edges of the image
@@ -62,10 +63,17 @@ class Scene:
     def field(self, method: str, scheme: str) -> Field:
         return reconstruct(self.volume, method, boundary="reflect", scheme=scheme)
 
-    def image(self, field: Field) -> Tensor:
+    def image(self, field: Field, **options: Any) -> Tensor:
         """(size, size, 4) by filterlab's renderer; the field's scheme decides which marcher works."""
-        size = (self.size, self.size)
-        return render(field, self.camera, self.transfer, size=size, step=self.step, shading=self.shading)
+        return render(field, self.camera, self.transfer, **self._options, **options)
+
+    def samples(self, field: Field, **options: Any) -> int:
+        """Of all rays together, as the renderer counts them before it leaves any out."""
+        return prepare(field, self.camera, self.transfer, **self._options, **options).samples
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        return {"size": (self.size, self.size), "step": self.step, "shading": self.shading}
 
 
 def marschner_lobb(n: int, size: int, **options: Any) -> Scene:

@@ -26,6 +26,7 @@ _NAMES = (
     "inverse_dvr",
     "speed_accuracy",
     "equal_error",
+    "brick_economy",
     "fit_kernel",
     "recommend_validation",
     "stability",

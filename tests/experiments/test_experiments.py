@@ -110,6 +110,16 @@ def tiny(name, scan):
             "iterations": 2,
         },
     }
+    configs["brick_economy"] = {
+        "scans": [{"file": "not_here.nrrd", "optional": True}],
+        "signals": [{"signal": "gaussian", "resolution": 12}],
+        "methods": ["triquadratic"],
+        "budgets": [0.001, 0.01],
+        "points": 100,
+        "timed_points": 100,
+        "size": 4,
+        "seconds": 0,
+    }
     configs["equal_error"] = {
         "studies": [{"signal": {"name": "gaussian", "parameters": {"sigma": 0.5}}}],
         "comparisons": [
