@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from experiments.extremes import CASES
+from experiments.extremes import CASES, document
 from experiments.extremes.contract import Case, Finding, Subject, Tally, random_numbers
 
 AMOUNT = 0.1
@@ -69,3 +69,30 @@ def test_a_sweep_leaves_out_what_a_method_does_not_offer() -> None:
     assert Subject("mitchell", "eight_trilinear") not in found
     assert Subject("notch", "eight_trilinear") in found
     assert Case("y", "", "", lambda *_: Finding(1, 0, 0)).subjects() == [Subject()]
+
+
+# --- the documentation ------------------------------------------------------------------------------------------------
+
+
+def test_the_documentation_shows_every_case_as_it_is_promised_and_none_broken() -> None:
+    text = document.DOCUMENT.read_text(encoding="utf-8")
+    measured = text.split(document.BEGIN)[1].split(document.END)[0]
+    rows = [line for line in measured.splitlines() if line.startswith("| ")][1:]
+    shown = [tuple(row.replace("\\|", "¦").split(" | ")[:2]) for row in rows]
+    assert shown == [(f"| {case.title}", case.contract.replace("|", "¦")) for case in CASES.values()]
+    assert all(row.endswith("| kept |") for row in rows)
+
+
+def test_only_what_stands_between_the_markers_is_replaced() -> None:
+    text = f"before\n{document.BEGIN}\nold\n{document.END}\nafter\n"
+    changed = document.with_table(text, "new\n")
+    assert changed == f"before\n{document.BEGIN}\nnew\n{document.END}\nafter\n"
+    assert document.with_table(changed, "new\n") == changed
+    for broken in ("", document.BEGIN, f"{document.END}{document.BEGIN}", text + text):
+        with pytest.raises(ValueError, match="expected one line <!-- measured: begin -->"):
+            document.with_table(broken, "new\n")
+
+
+def test_a_folder_without_records_is_said_so(tmp_path, capsys) -> None:
+    assert document.main([str(tmp_path)]) == 1
+    assert "has no records" in capsys.readouterr().err

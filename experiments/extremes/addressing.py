@@ -1,13 +1,20 @@
-"""Arrays of more than 2³¹ numbers: addresses are 64 bits wide.
+"""More than 2³¹ voxels, and more than 2³¹ points: addresses of 64 bits, tried on memory that is mapped but not used.
 
-Such a volume is a file with a hole: it has its full size, but only the pages that are written to take any room. What is
-read from it, next to where 32 bits would have wrapped round, is compared with the same numbers in a small volume.
+A volume of 1,300³ voxels of a byte is an anonymous mapping whose pages are nowhere until something is written to them:
+one corner is. The fields and the marcher must find in that corner what they find in a small volume that holds only it.
+Points are 2³¹ + 5, of which the last are evaluated: the address of a point and those of its rows are beyond 32 bits.
 """
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
+import ctypes
+import mmap
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -15,56 +22,146 @@ from torch import Tensor
 
 import filterlab as fl
 from experiments.extremes.contract import Case, Finding, Subject, Tally
-from filterlab import ops
-from filterlab.fields.tensor_product import Direct
+from experiments.extremes.coordinates import largest
+from filterlab.fields.grid import GridField
+from filterlab.fields.tensor_product import reach_of
+from filterlab.kernels import bspline
+from filterlab.ops import Stencil, cpu, gather
+from filterlab.ops.cpu import compiler
+from filterlab.ops.cpu.points import BLOCK
+from filterlab.render import TransferFunction, render
+from filterlab.volume import Geometry
 
-SHAPE = (1400, 1300, 1300)  # 2.37·10⁹ voxels
-PIECE = 12
-
-
-def huge_volumes(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
-    """Sums over taps at the far end of a volume of 2.4·10⁹ bytes, most of which were never written."""
-    if subject.scheme == "eight_trilinear":
-        return Finding(0, 0.0, 0.0, skipped="its samples are sums of the scheme direct")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "volume"
-        try:
-            with path.open("wb") as file:
-                file.truncate(int(np.prod(SHAPE)))
-            if path.stat().st_blocks * 512 > 2**20:
-                return Finding(0, 0.0, 0.0, skipped="this file system has no files with holes")
-            return _compared(subject, np.memmap(path, np.uint8, "r+", shape=SHAPE), random, amount)
-        except (OSError, AttributeError) as error:  # st_blocks is POSIX; a small disk may refuse the length
-            return Finding(0, 0.0, 0.0, skipped=f"no room for a file with a hole of 2.4 GB ({error})")
+EDGE, CORNER = 1300, 24  # voxels along an axis, of the volume and of its corner that is written to; 1300³ > 2³¹
+POINTS = 2**31 + 5
+MAP_NORESERVE = 0x4000  # of Linux; Python 3.13 has a name for it
 
 
-def _compared(subject: Subject, mapped: np.memmap, random: np.random.Generator, amount: float) -> Finding:
-    tally = Tally(1e-5)
-    stencil = Direct(fl.METHODS[subject.method].value_terms).stencils[1]
-    implementation = "cpu" if subject.scheme == "fused" else "reference"
-    corners = [tuple(n - PIECE for n in SHAPE), (SHAPE[0] // 2, 3, 5), (0, 0, 0)]
-    count = max(int(2000 * amount), 200)
-    for corner in corners:
-        piece = random.integers(0, 256, (PIECE,) * 3, dtype=np.uint8)
-        mapped[tuple(slice(c, c + PIECE) for c in corner)] = piece
-        local = torch.tensor(random.uniform(2, PIECE - 3, (1, count, 3)), dtype=torch.float64)
-        offset = torch.tensor(corner[::-1], dtype=torch.float64)
-        volume = torch.from_numpy(mapped)[None, None]
-        found = ops.gather(volume, local + offset, stencil, 0, implementation)
-        small = torch.from_numpy(piece.astype(np.float64))[None, None]
-        expected = ops.gather(small, local, stencil, 0, "reference")
-        tally.error(_largest(found - expected) / 255, f"at {corner} of a volume {SHAPE}", count)
+def mapped(bytes_wanted: int) -> mmap.mmap | str:
+    """Memory that takes none until it is written to; or why there is none."""
+    if sys.platform != "linux":
+        return "memory is mapped without being reserved on Linux only"
+    try:
+        return mmap.mmap(-1, bytes_wanted, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | MAP_NORESERVE)
+    except (OSError, ValueError) as error:
+        return f"{bytes_wanted / 2**30:.0f} GiB of untouched memory can't be mapped: {error}"
+
+
+@lru_cache(maxsize=1)
+def vast_and_corner() -> tuple[Tensor, Tensor] | str:
+    """A volume of more than 2³¹ voxels of uint8 that are 0 but in its last corner, and that corner."""
+    memory = mapped(EDGE**3)
+    if isinstance(memory, str):
+        return memory
+    vast = torch.frombuffer(memory, dtype=torch.uint8).reshape(EDGE, EDGE, EDGE)
+    corner = torch.randint(0, 256, (CORNER,) * 3, generator=torch.Generator().manual_seed(5), dtype=torch.uint8)
+    vast[-CORNER:, -CORNER:, -CORNER:] = corner
+    return vast, corner
+
+
+def field_over(subject: Subject, coefficients: Tensor, first: int) -> GridField:
+    """The subject's field of given coefficients as they lie, the first of them at `first` along every axis."""
+    gradient = fl.METHODS[subject.method].sampled_gradient if subject.scheme == "eight_trilinear" else None
+    few = torch.zeros((8, 8, 8), dtype=torch.uint8)
+    built = fl.reconstruct(few, subject.method, scheme=subject.scheme, gradient=gradient, prefilter=False)
+    assert isinstance(built, GridField)
+    size = (coefficients.shape[2], coefficients.shape[1], coefficients.shape[0])
+    built.coefficients = replace(built.coefficients, values=coefficients, start=first, size=size, quantization=None)
+    built.placement = built.coefficients.placement(Geometry())
+    built.domain = replace(built.domain, upper=(size[0] - 0.5, size[1] - 0.5, size[2] - 0.5))
+    return built
+
+
+def many_voxels(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """A field of 1,300³ coefficients near its last corner, against the field of that corner alone."""
+    made = vast_and_corner()
+    if isinstance(made, str):
+        return Finding(0, 0.0, 0.0, skipped=made)
+    vast, corner = made
+    count = max(int(2000 * amount), 100)
+    margin = reach_of(fl.METHODS[subject.method].value_terms) + 2
+    points = random.integers(64 * margin, 64 * (CORNER - margin), (count, 3)) / 64.0  # float32 holds them exactly
+    near = torch.tensor(points, dtype=torch.float32)
+    tally = Tally(2e-6)
+    own, whole = field_over(subject, corner, 0), field_over(subject, vast, 0)
+    for found, expected in zip(whole.jet(near + (EDGE - CORNER), 1), own.jet(near, 1), strict=True):
+        tally.error(largest(found - expected) / 255, "another sum than that of the corner alone", count)
+        tally.kept(largest(expected) > 10, "there is nothing in the corner")
     return tally.finding()
 
 
-def _largest(x: Tensor) -> float:
-    return float(x.abs().max())
+def march_through_many(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """Rays through the last corner of 1,300³ coefficients, empty space left out, against the corner alone."""
+    made = vast_and_corner()
+    if isinstance(made, str):
+        return Finding(0, 0.0, 0.0, skipped=made)
+    images = []
+    directions = torch.tensor([[0.0, 0.0, 1.0]]).double().expand(max(int(200 * amount), 20), 3)
+    across = torch.tensor(random.uniform(4, CORNER - 5, (len(directions), 3)), dtype=torch.float64)
+    transfer = TransferFunction([0.0, 60.0, 255.0], [[1, 0.5, 0], [0.2, 1, 0], [0, 0.3, 1]], [0.0, 0.0, 0.3])
+    for coefficients in made:
+        first = float(coefficients.shape[0] - CORNER)
+        box = ([first + 4.0] * 3, [first + CORNER - 5.0] * 3)
+        origins = across * torch.tensor([1.0, 1.0, 0.0]) + torch.tensor([first, first, first + 1.0])
+        field = field_over(replace(subject, method="triquadratic"), coefficients, 0)
+        images.append(render(field, (origins, directions), transfer, region=box, step=0.5))
+    tally = Tally(2e-4)  # float32 coordinates of 1,300 voxels are multiples of 1/8192
+    tally.error(largest(images[0] - images[1]), "another image than that of the corner alone", len(directions))
+    tally.kept(largest(images[1][:, 3]) > 0.5, "there is nothing in the corner")
+    return tally.finding()
+
+
+def scatter_into_many(_subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """Add to the last corner of 1,300³ coefficients of float32, against adding to the corner alone."""
+    count, tally = max(int(500 * amount), 50), Tally(2e-6)
+    points = torch.tensor(random.integers(64 * 3, 64 * (CORNER - 3), (1, count, 3)) / 64.0, dtype=torch.float32)
+    cotangents = torch.tensor(random.uniform(-1, 1, (1, 1, 4, count)), dtype=torch.float32)
+    memory = mapped(4 * EDGE**3 + 4)
+    if isinstance(memory, str):
+        return Finding(0, 0.0, 0.0, skipped=memory)
+    vast = torch.frombuffer(memory, dtype=torch.float32)[:-1].reshape(1, 1, EDGE, EDGE, EDGE)
+    stencil = Stencil.jet(bspline(2), 1)
+    cpu._run("scatter", [vast], points + (EDGE - CORNER), cotangents, stencil, 0)
+    expected = cpu.scatter(cotangents, points, stencil, (CORNER,) * 3)
+    found = vast[..., -CORNER:, -CORNER:, -CORNER:]
+    tally.error(largest(found - expected) / largest(expected), "something else was added to the corner", count)
+    tally.kept(largest(expected) > 0.1, "nothing was added")
+    return tally.finding()
+
+
+def many_points(_subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """2³¹ + 5 points, of which the last chunk is evaluated: value and gradient, against those points alone."""
+    count, tally = max(int(1000 * amount), 100), Tally()
+    point_memory, row_memory = mapped(12 * POINTS), mapped(16 * POINTS)
+    for memory in (point_memory, row_memory):
+        if isinstance(memory, str):
+            return Finding(0, 0.0, 0.0, skipped=memory)
+    points = torch.frombuffer(point_memory, dtype=torch.float32).reshape(1, POINTS, 3)  # type: ignore[call-overload]
+    rows = torch.frombuffer(row_memory, dtype=torch.float32).reshape(1, 1, 4, POINTS)  # type: ignore[call-overload]
+    coefficients = torch.tensor(random.uniform(-1, 1, (1, 1, 9, 8, 7)), dtype=torch.float32)
+    points[0, -count:] = torch.tensor(random.uniform(0, 6, (count, 3)), dtype=torch.float32)
+    stencil = Stencil.jet(bspline(2), 1)
+
+    with mock.patch("filterlab.ops.cpu.threads.run", lambda function, jobs: _run_the_last(function, jobs[0], count)):
+        cpu._run("gather", [coefficients], points, rows, stencil, 0)
+    expected = gather(coefficients, points[:, -count:].clone(), stencil, 0, "cpu")
+    tally.kept(torch.equal(rows[..., -count:], expected), "other bits than those points alone", count)
+    tally.kept(largest(expected) > 0.1, "the rows are empty")
+    return tally.finding()
+
+
+def _run_the_last(function: Callable[[int], object], job: Any, count: int) -> None:
+    """Only the chunks that hold the last `count` points, on this thread."""
+    lanes = cpu._lanes(compiler.features(), 4)
+    packs = -(-job.count // lanes)
+    job.chunk = BLOCK
+    job.chunks = -(-packs // BLOCK)
+    job.next = job.chunks - count // (lanes * BLOCK) - 2
+    function(ctypes.addressof(job))
 
 
 def many_segments(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
     """A ray of 3·10⁹ segments: the count is exact, and an image of it is refused before it is marched."""
-    from filterlab.render import TransferFunction, render
-
     tally = Tally()
     field = fl.reconstruct(torch.rand(8, 8, 8), "trilinear")
     rays = torch.tensor([[-3.0, 4, 4]], dtype=torch.float64), torch.tensor([[1.0, 0, 0]], dtype=torch.float64)
@@ -79,15 +176,26 @@ def many_segments(subject: Subject, random: np.random.Generator, amount: float) 
     return tally.finding()
 
 
+PROMISE = "Addresses have 64 bits: what stands beyond 2³¹ is what it would be in a small volume, within 2·10⁻⁶."
 CASES = (
+    Case("many-voxels", "a volume of 1,300³ > 2³¹ voxels", PROMISE, many_voxels, ("method", "scheme"), 0.1),
     Case(
-        "huge-volumes",
-        "2.4·10⁹ voxels",
-        "Taps beyond 2³¹ are read where they are.",
-        huge_volumes,
-        ("method", "scheme"),
-        0.3,
+        "march-through-many",
+        "an image of 1,300³ > 2³¹ voxels",
+        "The fused and the plain marcher read, skip and composite beyond 2³¹ voxels as in a small volume.",
+        march_through_many,
+        ("scheme",),
+        2.0,
     ),
+    Case(
+        "scatter-into-many",
+        "derivatives by 1,300³ > 2³¹ voxels",
+        "They are added beyond 2³¹ voxels as in a small volume, within 2·10⁻⁶ of the largest.",
+        scatter_into_many,
+        (),
+        0.2,
+    ),
+    Case("many-points", "2³¹ + 5 points", "The last ones have the bits that they have alone.", many_points, (), 0.2),
     Case(
         "many-segments",
         "10⁹ … 10¹⁸ samples of a ray",

@@ -72,6 +72,7 @@ class Case:
         check: measures it.
         sweep: the parts of a subject that it is checked for: some of method, scheme, boundary, device.
         seconds: what one subject takes at full length, roughly, on one core.
+        tested: the amount that tests can afford.
     """
 
     key: str
@@ -80,6 +81,7 @@ class Case:
     check: Check
     sweep: tuple[str, ...] = ()
     seconds: float = 0.5
+    tested: float = 0.1
 
     def subjects(
         self,

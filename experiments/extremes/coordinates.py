@@ -14,6 +14,7 @@ from torch import Tensor
 import filterlab as fl
 from experiments.extremes.contract import Case, Finding, Subject, Tally
 from filterlab.fields.grid import GridField
+from filterlab.render import Light, Shading, TransferFunction, render
 
 SIZE = (6, 7, 9)  # D, H, W of the volumes
 SWEEP = ("method", "scheme", "boundary", "device")
@@ -197,19 +198,38 @@ ORIGIN = (1e6, -1e6, 2e6)
 
 
 def far_from_the_origin(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
-    """The volume stands millions of voxels away; its points are given in float64, and in float32 for comparison."""
+    """The volume stands millions of voxels away; its points are given in float64, and measured from a point nearby."""
     tally = Tally(1e-5)
     samples = samples_on(subject.device)
     near, far = field_of(subject), field_of(subject, fl.Volume(samples, origin=ORIGIN))
     count = max(int(2000 * amount), 50)
-    points = points_inside(random, count, subject.device).double()
-    moved = points + points.new_tensor(ORIGIN)
-    lost = 0.0
-    for exact, kept, rough in zip(near.jet(points, 1), far.jet(moved, 1), far.jet(moved.float(), 1), strict=True):
-        tally.error(largest(exact - kept), "digits were lost with float64 points", count)
-        lost = max(lost, largest(exact - rough))
+    points = points_inside(random, count, subject.device)
+    moved = points.double() + points.new_tensor(ORIGIN, dtype=torch.float64)
+    exact, lost = near.jet(points.double(), 1), 0.0
+    for found, how in ((far.jet(moved, 1), "in float64"), (far.relative_to(ORIGIN).jet(points, 1), "measured nearby")):
+        for a, b in zip(exact, found, strict=True):
+            tally.error(largest(a - b), f"digits were lost with points {how}", count)
+    for a, b in zip(exact, far.jet(moved.float(), 1), strict=True):
+        lost = max(lost, largest(a - b))
     found = tally.finding()
     return replace(found, note=found.note or f"with float32 points the error is {lost:.2g}")
+
+
+def images_far_from_the_origin(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
+    """The same rays through the same volume, at the origin and millions of voxels away."""
+    tally, count = Tally(1e-5), max(int(400 * amount), 40)
+    samples, size = samples_on(subject.device), np.array(SIZE[::-1])
+    inside = torch.tensor(random.uniform(0, size - 1, (count, 3)), device=subject.device)
+    directions = torch.tensor(random.normal(size=(count, 3)), device=subject.device)
+    transfer = TransferFunction([-1.0, 0.0, 1.0], [[1, 0.5, 0], [0.2, 1, 0], [0, 0.3, 1]], [0.0, 0.1, 0.5])
+    images = []
+    for origin in ((0.0, 0.0, 0.0), ORIGIN):
+        field = field_of(subject, fl.Volume(samples, origin=origin))
+        rays = inside - 20 * directions + inside.new_tensor(origin), directions
+        images.append(render(field, rays, transfer, shading=Shading(lights=[Light((0.5, -1, 0.2))])))
+    tally.error(largest(images[0] - images[1]), "another image than at the origin", count)
+    tally.kept(largest(images[0][:, 3]) > 0.3, "there is nothing to see")
+    return tally.finding()
 
 
 def largest(x: Tensor) -> float:
@@ -253,9 +273,18 @@ CASES = (
     Case(
         "far-from-the-origin",
         "a volume 10⁶ voxels from the origin",
-        "Float64 points keep 10⁻⁵ of the range in value and gradient; float32 points have lost their digits already.",
+        "Float64 points, and float32 points measured from nearby (`relative_to`), keep value and gradient to 10⁻⁵; "
+        "float32 points in the world have lost their digits already.",
         far_from_the_origin,
         SWEEP,
         0.05,
+    ),
+    Case(
+        "images-far-from-the-origin",
+        "an image of a volume 10⁶ voxels from the origin",
+        "Within 10⁻⁵ of the image at the origin, by the fused and by the plain marcher.",
+        images_far_from_the_origin,
+        SWEEP,
+        0.2,
     ),
 )

@@ -125,7 +125,7 @@ def threads(number: int) -> Iterator[None]:
 def repeatable(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
     """Fields give the same bits for any batch, cut and number of threads; derivatives by samples to 10⁻⁵."""
     tally = Tally(1e-5)
-    count = max(int(10_000 * amount), 2000)
+    count = min(max(int(10_000 * amount), 2000), 20_000)
     points = points_inside(random, count, subject.device)
     samples = samples_on(subject.device).clone().requires_grad_()
     found = []

@@ -24,6 +24,8 @@ def draw(_config: Config, records: Mapping[str, Record], _folder: Path) -> Secti
     """The section of the report."""
     cases = _by_case(records)
     blocks: list[Block] = [_table(cases)]
+    if swept := {key: found for key, found in cases.items() if any(r["method"] for r in found)}:
+        blocks.append(_by_method_and_scheme(swept))
     if broken := [r for found in cases.values() for r in found if _verdict(r) == "broken"]:
         blocks.insert(0, _details(broken, "Promises that were broken, with the input that broke them worst."))
     if skipped := [r for found in cases.values() for r in found if r["skipped"]]:
@@ -57,7 +59,38 @@ COLUMNS = (
 
 
 def _table(cases: Mapping[str, Sequence[Record]]) -> Table:
-    return Table(COLUMNS, [_row(found) for found in cases.values()], "All promises, in the order of the contract.")
+    caption = "All promises, in the order of the contract; of errors the one that came nearest to what is allowed."
+    return Table(COLUMNS, [_row(found) for found in cases.values()], caption, wrapped=True)
+
+
+def _by_method_and_scheme(cases: Mapping[str, Sequence[Record]]) -> Table:
+    """For every case and method the worst share of what is allowed, a line for each scheme."""
+    methods = list(dict.fromkeys(r["method"] for found in cases.values() for r in found if r["method"]))
+    columns = [Column("input", numeric=False), Column("scheme", numeric=False), *(Column(m) for m in methods)]
+    rows = []
+    for found in cases.values():
+        schemes = list(dict.fromkeys(r["scheme"] for r in found))
+        for scheme in schemes:
+            cells = [_cell([r for r in found if (r["method"], r["scheme"]) == (m, scheme)]) for m in methods]
+            rows.append([found[0]["title"] if scheme == schemes[0] else "", scheme or "any", *cells])
+    caption = (
+        "By method and scheme, over all boundaries and devices: the worst error in percent of what is allowed; “kept” "
+        f"where nothing but keeping the promise counts, “BROKEN” where it was not; {MISSING} where a method does not "
+        "offer the scheme."
+    )
+    return Table(columns, rows, caption, wrapped=True)
+
+
+def _cell(found: Sequence[Record]) -> str:
+    tried = [r for r in found if not r["skipped"]]
+    if not tried:
+        return "skipped" if found else MISSING
+    if not all(r["holds"] for r in tried):
+        return "BROKEN"
+    if not any(r["bound"] for r in tried):
+        return "kept"
+    percent = 100 * max(_share(r) for r in tried)
+    return "0" if percent == 0 else "< 0.1 %" if percent < 0.1 else f"{text(percent, 2)} %"
 
 
 def _row(found: Sequence[Record]) -> list[str]:
@@ -107,7 +140,7 @@ def _details(records: Sequence[Record], caption: str) -> Table:
     columns = [Column(n, numeric=False) for n in ("input", *PARTS)]
     columns += [Column("worst error"), Column("allowed"), Column("note", numeric=False)]
     rows = [[r["title"], *(r[n] or MISSING for n in PARTS), *_numbers(r), _note(r)] for r in records]
-    return Table(columns, rows, caption)
+    return Table(columns, rows, caption, wrapped=True)
 
 
 def _note(record: Record) -> str:

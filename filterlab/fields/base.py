@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -37,6 +39,11 @@ class Domain:
         box = torch.tensor([self.lower, self.upper], dtype=torch.float64)
         return self.geometry.to_world(torch.cartesian_prod(*box.T))
 
+    def relative_to(self, origin: Sequence[float]) -> Domain:
+        """The same box in a world whose origin lies at `origin` of this one."""
+        moved = tuple(a - float(b) for a, b in zip(self.geometry.origin, origin, strict=True))
+        return replace(self, geometry=replace(self.geometry, origin=moved))
+
     @property
     def center(self) -> tuple[float, float, float]:
         """World centre of the box."""
@@ -56,6 +63,10 @@ class Field(ABC):
     gradients `(*P, 3)` and Hessians `(*P, 3, 3)`; a batched one (`channels` is (N, C)) maps points `(N, *P, 3)` to
     `(N, C, *P)`, `(N, C, *P, 3)` and `(N, C, *P, 3, 3)`. Gradients are per world unit. Everything is computed in
     promote(points.dtype, float32), and is differentiable in the points and in whatever the field was built from.
+
+    Far from the origin float32 points have lost their digits before a field sees them: a million voxels away they are
+    multiples of 1/16 voxel. Give points in float64, or, to compute in float32, measured from a point nearby:
+    `field.relative_to(origin)(points - origin)`.
     """
 
     domain: Domain
@@ -74,6 +85,47 @@ class Field(ABC):
         """Values and gradients (per world unit) at the points, in one pass."""
         value, gradient = self.jet(points, 1)
         return value, gradient
+
+    def relative_to(self, origin: Sequence[float]) -> Field:
+        """The same function of points that are measured from `origin`: g(p) = f(origin + p).
+
+        origin + p is never rounded to the type of p, so that float32 points near `origin` keep their digits however far
+        from the world's origin that is. Derivatives are those of f at origin + p.
+
+        Args:
+            origin: a world point x, y, z. It is taken as numbers, not differentiated.
+
+        Raises:
+            ValueError: not three finite numbers.
+        """
+        origin = _checked_origin(origin)
+        return self if origin == (0.0, 0.0, 0.0) else self._relative_to(origin)
+
+    def _relative_to(self, origin: tuple[float, float, float]) -> Field:
+        return _Relative(self, origin)
+
+
+class _Relative(Field):
+    """Any field in a world whose origin was moved; sums of points and origin are float64."""
+
+    def __init__(self, field: Field, origin: tuple[float, float, float]) -> None:
+        self.field, self.origin = field, origin
+        self.domain, self.max_order, self.channels = field.domain.relative_to(origin), field.max_order, field.channels
+
+    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+        points = check_points(points, self.channels)
+        moved = points.double() + torch.tensor(self.origin, dtype=torch.float64, device=points.device)
+        return tuple(row.to(points.dtype) for row in self.field.jet(moved, order))
+
+
+def _checked_origin(origin: Sequence[float]) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(c) for c in origin)
+    except (TypeError, ValueError):
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise ValueError(f"origin must be three finite numbers in x, y, z order; got {origin!r}")
+    return x, y, z
 
 
 def check_points(points: Tensor, channels: tuple[int, int] | None) -> Tensor:

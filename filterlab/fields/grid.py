@@ -199,6 +199,13 @@ class GridField(Field):
         one.channels = None
         return one
 
+    def _relative_to(self, origin: tuple[float, float, float]) -> GridField:
+        """The grid moves instead: numbers of float64, no work for any point."""
+        moved = copy(self)
+        moved.domain = self.domain.relative_to(origin)
+        moved.placement = replace(self.placement, geometry=moved.domain.geometry)
+        return moved
+
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         check_order(order, self.max_order)
         points = check_points(points, self.channels)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -107,6 +107,7 @@ class PlainMarcher:
 
         Differentiable any number of times; blocks are recomputed in the backward pass, so that memory stays bounded.
         """
+        medium, chords = _from_the_first_voxel(medium, chords)
         count = chords.count
         light = torch.zeros_like(chords.entry)
         depth = torch.zeros_like(chords.length)
@@ -128,6 +129,13 @@ class PlainMarcher:
             first += BLOCK
             alive = alive[_goes_on(medium, count[alive], depth[alive].detach(), first)]
         return light, depth
+
+
+def _from_the_first_voxel(medium: Medium, chords: Chords) -> tuple[Medium, Chords]:
+    """The same in a world whose origin is the volume's own: samples keep their digits wherever the volume stands."""
+    origin = medium.field.domain.geometry.origin
+    field = medium.field.relative_to(origin)
+    return replace(medium, field=field), replace(chords, entry=chords.entry - chords.entry.new_tensor(origin))
 
 
 def rays_at_once(memory: int, dtype: torch.dtype, differentiable: bool) -> int:
