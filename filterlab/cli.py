@@ -299,7 +299,7 @@ class Recommend:
             _check_not_input(self.output, self.volume)
 
         from filterlab import recommendation_report as report
-        from filterlab.io.volumes import load_volume
+        from filterlab.io.volumes import describe, load_volume
         from filterlab.missing_values import CHOICES
         from filterlab.recommendation import TASKS, recommend
         from filterlab.volume import Boundary
@@ -310,6 +310,8 @@ class Recommend:
             ("nan", self.nan, CHOICES),
         ):
             _check_name(what, name, known)
+        if self.output is not None and len(shape := describe(self.volume).shape) != 3:
+            raise ValueError(f"expected one volume (D, H, W) to write a scene of; {self.volume} has {tuple(shape)}")
         volume = load_volume(self.volume)
         with _progress_bar() as progress:
             found = recommend(

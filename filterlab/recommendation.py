@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,8 @@ _WHOLE = 96**3  # voxels of a volume that is one block
 _POINTS = 6000  # of a block at which a rebuilt field is compared
 _CROP = 160  # voxels along an axis of the part that costs are measured on
 _RAYS, _SAMPLES = 128, 64
+_NEARLY = 1.01  # as good as the best
+_ROUNDING = 1e-6  # parts of the range: about what float32 leaves
 _RESOLVED = 0.1  # or less of the squared error comes from beyond the Nyquist frequency
 _DOUBT = 1.02  # of what is measured: by so much a method may be further off than it seems, the sampling apart
 _UNMEASURED = 1.5  # and so much where nothing could be held out
@@ -152,7 +155,8 @@ def recommend(
     Errors are root mean squares over the inner 0.9 of the volume, in parts of its range (largest − smallest sample):
     of the value for task "resample"; of the value or of the gradient per voxel, whichever is larger, for "isosurface"
     and "dvr", where surfaces and light come from the gradient; for "dvr" together with what a march loses by its step
-    s, the RMS of s² |f''| / 24 along rays (the step is the longest one that loses at most half of the budget).
+    s, the RMS of s² |f''| / 24 along rays. Every candidate has its own step: the longest one with which it stays within
+    the budget; where it does not with any, the longest one that makes its error at most 1 % larger than the shortest.
 
     Args:
         volume: a `Volume` or a bare tensor.
@@ -183,17 +187,19 @@ def recommend(
     span = (high - low) or 1.0
     progress(0.0, "spectra and hold-outs")
     found = _errors(flat, names, seed, lambda done: progress(0.5 * done, "spectra and hold-outs"))
-    near = {name: found.methods[name].estimate(task, span, (0.0, 0.0), 0.0)[0].high <= max_error for name in names}
+    near = {name: found.methods[name].estimate(task, span, (0.0, 0.0)).high <= max_error for name in names}
     ways = [way for name in names for way in _ways(METHODS[name], flat.dtype, near[name])]
     progress(0.5, "costs")
     measured = _costs(flat[0], volume, ways, boundary, task, seconds, lambda done: progress(0.5 + 0.5 * done, "costs"))
-    step, lost = _step(found.second_derivative / span, max_error) if task == "dvr" else (None, 0.0)
     candidates = []
     for way, cost in measured.items():
-        error, known = found.methods[way[0]].estimate(task, span, (cost.value_rounding, cost.gradient_rounding), lost)
-        count = _samples_of(task, volume, step)
-        seconds_needed = cost.build + 1e-9 * count * cost.nanoseconds
-        candidates.append(Candidate(*way, step, error, known, seconds_needed, cost.nanoseconds, cost.memory))
+        errors, rounding = found.methods[way[0]], (cost.value_rounding, cost.gradient_rounding)
+        estimate = partial(errors.estimate, task, span, rounding)
+        bend = found.second_derivative / span
+        step, error = _marched(estimate, bend, max_error) if task == "dvr" else (None, estimate())
+        seconds_needed = cost.build + 1e-9 * _samples_of(task, volume, step) * cost.nanoseconds
+        resolved_here = errors.resolved(span)
+        candidates.append(Candidate(*way, step, error, resolved_here, seconds_needed, cost.nanoseconds, cost.memory))
     candidates.sort(key=lambda c: (c.seconds, c.memory))
     fitting = [c for c in candidates if _fits(c, max_error, max_memory, max_time)]
     return Recommendation(
@@ -257,10 +263,12 @@ class _MethodErrors:
     spread: float
     beyond: float
 
-    def estimate(
-        self, task: str, span: float, rounding: tuple[float, float], lost: float
-    ) -> tuple[ErrorEstimate, bool]:
-        """What the task counts, with what storage and step add; and whether the volume resolves what it shows."""
+    def resolved(self, span: float) -> bool:
+        """Whether the volume resolves what it shows; an error that is rounding says nothing of that."""
+        return self.beyond < _RESOLVED or self.predicted[0] <= _ROUNDING * span
+
+    def estimate(self, task: str, span: float, rounding: tuple[float, float], lost: float = 0.0) -> ErrorEstimate:
+        """What the task counts, with what storage and step add."""
 
         def counted(errors: tuple[float, float]) -> float:
             both = [math.hypot(e, r) / span for e, r in zip(errors, rounding, strict=True)]
@@ -270,7 +278,7 @@ class _MethodErrors:
         measured = None if self.measured is None else counted(self.measured)
         known = [predicted] if measured is None else [predicted, measured]
         doubt = (_UNMEASURED if measured is None else _DOUBT) * math.sqrt(1 + self.spread)
-        return ErrorEstimate(predicted, measured, min(known) / doubt, max(known) * doubt), self.beyond < _RESOLVED
+        return ErrorEstimate(predicted, measured, min(known) / doubt, max(known) * doubt)
 
 
 @dataclass(frozen=True)
@@ -376,12 +384,17 @@ class _HoldOut:
         return float(off[0]), float(off[1])
 
 
-def _step(second_derivative: float, budget: float) -> tuple[float, float]:
-    """The longest step that loses at most half of the budget, and what it loses; in parts of the range."""
-    for step in STEPS:
-        if step**2 * second_derivative / 24 <= budget / 2:
-            break
-    return step, step**2 * second_derivative / 24
+def _marched(
+    estimate: Callable[[float], ErrorEstimate], second_derivative: float, budget: float
+) -> tuple[float, ErrorEstimate]:
+    """The longest step within the budget and the error with it; the second derivative in parts of the range.
+
+    Where no step is, the longest one that is nearly as good as the shortest.
+    """
+    errors = {step: estimate(step**2 * second_derivative / 24) for step in STEPS}
+    least = errors[STEPS[-1]].high
+    allowed = budget if least <= budget else _NEARLY * least
+    return next((step, error) for step, error in errors.items() if error.high <= allowed)
 
 
 # --- costs ------------------------------------------------------------------------------------------------------------

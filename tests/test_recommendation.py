@@ -13,7 +13,7 @@ import filterlab as fl
 from filterlab import recommendation_report as report
 from filterlab.cli import MEMORY, TIME, UsageError, main, quantity
 from filterlab.io.config import loads_config
-from filterlab.recommendation import Recommendation, recommend
+from filterlab.recommendation import ErrorEstimate, Recommendation, _marched, recommend
 from filterlab.render.scene import Scene
 
 FAST = {"seconds": 0.05}
@@ -79,16 +79,56 @@ def test_gradients_count_for_surfaces_and_pictures(samples) -> None:
     for method in ("trilinear", "notch"):
         value, surface, picture = (errors[task][method].error.predicted for task in ("resample", "isosurface", "dvr"))
         assert value < surface < picture
-        assert errors["dvr"][method].step == 0.125
+        assert errors["dvr"][method].step is not None
         assert errors["resample"][method].step is None
 
 
-def test_the_step_is_the_longest_that_loses_half_of_the_budget(samples) -> None:
-    generous = recommend(samples, 5.0, task="dvr", methods=["trilinear"], **FAST)
-    tight = recommend(samples, 0.001, task="dvr", methods=["trilinear"], **FAST)
-    assert generous.chosen.step == 1.0
-    assert tight.chosen.step is not None
-    assert tight.chosen.step < 1.0
+@pytest.mark.parametrize(
+    ("budget", "expected"),
+    [
+        (2.0, 1.0),
+        (1.0, 0.7),  # √(0.9² + (0.5 s²)²) ≤ 1 where s ≤ 0.934; half of the budget for the method would not be enough
+        (0.9005, 0.18),  # where s ≤ 0.245
+        (0.89, 0.5),  # none: at most 1 % above the shortest's √(0.9² + 0.0078²) where s ≤ 0.506
+    ],
+)
+def test_the_step_is_the_longest_within_the_budget(budget, expected) -> None:
+    """Of a method whose own error is 0.9, on a volume where a march loses 0.5 s²."""
+
+    def estimate(lost: float) -> ErrorEstimate:
+        error = math.hypot(0.9, lost)
+        return ErrorEstimate(error, None, error, error)
+
+    step, error = _marched(estimate, 12.0, budget)
+    assert step == expected
+    assert error == estimate(0.5 * step**2)
+
+
+def test_every_candidate_has_its_own_step(samples) -> None:
+    """Less is left for the march where the method takes more of the budget."""
+    answer = recommend(samples, 5.0, task="dvr", methods=["trilinear"], **FAST)
+    assert answer.chosen.step == 1.0
+    tight = 1.0001 * recommend(samples, 1e-9, task="isosurface", methods=["tricubic"], **FAST).chosen.error.high
+    found = recommend(samples, tight, task="dvr", methods=["trilinear", "tricubic"], **FAST)
+    steps = {c.method: c.step for c in found.candidates if c.storage is None}
+    assert steps["tricubic"] < steps["trilinear"]
+
+
+def test_a_volume_without_detail_is_resolved() -> None:
+    """What is left of a constant is rounding: nothing is said about its spectrum."""
+    for value in (3.0, -1e4):
+        answer = recommend(torch.full((20, 20, 20), value), 0.1, methods=["trilinear", "catmull-rom"], **FAST)
+        assert all(c.resolved for c in answer.candidates)
+    noise = torch.rand(20, 20, 20, generator=torch.Generator().manual_seed(0))
+    assert not any(c.resolved for c in recommend(noise, 0.5, methods=["tricubic"], **FAST).candidates)
+
+
+def test_a_scene_shows_one_volume(tmp_path, capsys) -> None:
+    fl.save_volume(fl.Volume(torch.rand(2, 1, 5, 6, 7)), tmp_path / "v.npy")
+    ask = ["recommend", str(tmp_path / "v.npy"), "--max-error", "90%"]
+    assert main([*ask, "-o", str(tmp_path / "s.yaml")]) == 1
+    assert "expected one volume (D, H, W) to write a scene of" in capsys.readouterr().err
+    assert not (tmp_path / "s.yaml").exists()
 
 
 def test_the_same_seed_finds_the_same_errors(samples) -> None:
