@@ -52,6 +52,18 @@ def test_knows_what_every_second_sample_would_lose(method) -> None:
     assert found.gradient == pytest.approx(slope, rel=0.1)
 
 
+@pytest.mark.parametrize("method", ["trilinear", "notch", "mitchell"])
+def test_holds_on_the_average_over_positions_of_the_grid(method) -> None:
+    """The error of a blob of 1.2 voxels depends on where it lies between voxels; a quarter off, it is the mean."""
+    errors = []
+    for quarters in (0, 1):
+        signal = fl.signals.gaussian(sigma=0.1, center=(quarters / 48,) * 3)
+        found = predicted_error(spectrum_of(signal.sample(24, dtype=torch.float64).samples), method).value
+        errors.append(found / measured(signal, 24, method)[0])
+    assert errors[1] == pytest.approx(1, abs=0.15)
+    assert abs(errors[0] - 1) > abs(errors[1] - 1)
+
+
 def test_a_plane_wave_has_the_error_of_its_frequency() -> None:
     """√E(ω)·amplitude/√2 by the definition, aliases summed one by one."""
     n, k = 64, 16
