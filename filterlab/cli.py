@@ -298,10 +298,9 @@ class Recommend:
             check_writable(self.output)
             _check_not_input(self.output, self.volume)
 
-        from filterlab import recommendation_report as report
         from filterlab.io.volumes import describe, load_volume
         from filterlab.missing_values import CHOICES
-        from filterlab.recommendation import TASKS, recommend
+        from filterlab.recommendation import TASKS, recommend, report
         from filterlab.volume import Boundary
 
         for what, name, known in (

@@ -32,7 +32,6 @@ FLOORS = {
     "io": 5,
     "prediction": 6,
     "recommendation": 7,
-    "recommendation_report": 8,
     "render": 9,
     "cli": 10,
     "__init__": 11,

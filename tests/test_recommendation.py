@@ -10,10 +10,10 @@ import torch
 import yaml
 
 import filterlab as fl
-from filterlab import recommendation_report as report
 from filterlab.cli import MEMORY, TIME, UsageError, main, quantity
 from filterlab.io.config import loads_config
-from filterlab.recommendation import ErrorEstimate, Recommendation, _marched, recommend
+from filterlab.recommendation import ErrorEstimate, Recommendation, recommend, report
+from filterlab.recommendation.choice import _marched
 from filterlab.render.scene import Scene
 
 FAST = {"seconds": 0.05}
@@ -181,7 +181,9 @@ def test_nan_voxels_are_refused_or_filled(samples) -> None:
     hole[3, 4, 5] = math.nan
     with pytest.raises(ValueError, match="1 NaN of 64,000"):
         recommend(hole, 0.1)
-    assert recommend(hole, 0.5, nan="fill", methods=["trilinear"], **FAST).pick is not None
+    filled = recommend(hole, 0.5, nan="fill", methods=["trilinear"], **FAST)
+    assert filled.pick is not None
+    assert bool(filled.field(hole)(torch.tensor([5.0, 4.0, 3.0])).isfinite())
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 from rich.text import Text
 
-from filterlab.recommendation_report import duration, percent, size
+from filterlab.recommendation.report import duration, percent, size
 from filterlab.render.plan import Plan
 
 

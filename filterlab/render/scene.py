@@ -22,7 +22,6 @@ import torch
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 from torch import Tensor
 
-from filterlab import recommendation_report as report
 from filterlab import signals
 from filterlab.fields.base import Domain
 from filterlab.fields.base import Field as FilterlabField
@@ -30,7 +29,7 @@ from filterlab.io.bounded import VolumeFileError
 from filterlab.io.config import StrictModel, load_config, unknown_name
 from filterlab.io.volumes import describe, load_volume
 from filterlab.methods import METHODS, reconstruct
-from filterlab.recommendation import recommend
+from filterlab.recommendation import recommend, report
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
 from filterlab.render.dvr import Progress, render
 from filterlab.render.rays import check_region

@@ -9,7 +9,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from filterlab.recommendation import IMAGE, Candidate, Recommendation
+from filterlab.recommendation.choice import IMAGE, Candidate, Recommendation
 
 COUNTED = {
     "resample": "RMS of the value",

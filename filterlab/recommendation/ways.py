@@ -1,0 +1,129 @@
+"""Ways to reconstruct a volume, and what each costs on this machine: methods with a scheme and a storage."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from filterlab import costs, metrics
+from filterlab.fields.grid import GridField
+from filterlab.methods import Method, reconstruct
+from filterlab.volume import Boundary, Volume
+
+STORAGE = ("float16", "int16", "uint8")
+
+_CROP = 160  # voxels along an axis of the part that costs are measured on
+_RAYS, _SAMPLES = 128, 64
+
+Way = tuple[str, str, str | None]
+"""Method, scheme, storage."""
+
+
+def ways_of(method: Method, dtype: torch.dtype, all_of_them: bool) -> Iterator[Way]:
+    """The first scheme that runs; or every scheme that gives the method's own gradient, and shorter storage."""
+    first = _first_scheme(method, dtype)
+    yield method.name, first, None
+    if all_of_them:
+        for scheme in method.schemes:
+            own = scheme != "eight_trilinear" or method.sampled_gradient == method.gradients[0]
+            if own and scheme != first:
+                yield method.name, scheme, None
+        for storage in STORAGE:
+            yield method.name, first, storage
+
+
+def _first_scheme(method: Method, dtype: torch.dtype) -> str:
+    """What `reconstruct` takes for such samples when it is not told."""
+    field = reconstruct(torch.zeros(2, 2, 2, dtype=dtype), method)
+    assert isinstance(field, GridField)
+    return field.scheme.name
+
+
+@dataclass(frozen=True)
+class WayCost:
+    """Seconds to build the whole field, nanoseconds per sample, bytes, and what the storage rounds off."""
+
+    build: float
+    nanoseconds: float
+    memory: int
+    value_rounding: float
+    gradient_rounding: float
+
+
+def costs_of(
+    samples: Tensor,
+    volume: Volume,
+    ways: list[Way],
+    boundary: Boundary,
+    task: str,
+    seconds: float,
+    tick: Callable[[float], None],
+) -> dict[Way, WayCost]:
+    """Of the ways that can run here: measured on the middle of (D, H, W), and carried over to the whole volume."""
+    part = samples
+    for dim, n in enumerate(samples.shape):
+        edge = min(n, _CROP)
+        part = part.narrow(dim, (n - edge) // 2, edge)
+    part = part.contiguous()
+    points = _points_along_rays(part)
+    fields = {way: _built(part, way, boundary) for way in ways}
+    runs = {way: field for way, field in fields.items() if field is not None and not _stored_so_anyway(way, fields)}
+    builders = {"/".join(map(str, way)): (lambda way=way: _built(part, way, boundary)) for way in runs}
+    order = 0 if task == "resample" else 1
+    taken = costs.measure(builders, points, order=order, seconds=seconds, tick=tick)  # type: ignore[arg-type]
+    whole = math.prod(volume.shape) / part.numel()
+    found = {}
+    for way, field in runs.items():
+        cost = taken["/".join(map(str, way))]
+        rounding = _rounding(field, runs[way[0], way[1], None], points)
+        memory = _memory_of_whole(field, volume)
+        found[way] = WayCost(cost.build.median * whole, cost.sample.median, memory, *rounding)
+    return found
+
+
+def _built(part: Tensor, way: Way, boundary: Boundary) -> GridField | None:
+    """The field, or None where it can't be as asked here (numbers that a short type does not hold, no fused scheme)."""
+    method, scheme, storage = way
+    try:
+        field = reconstruct(part, method, boundary=boundary, scheme=scheme, storage=storage)
+    except ValueError:
+        return None
+    assert isinstance(field, GridField)
+    return field
+
+
+def _stored_so_anyway(way: Way, fields: dict[Way, GridField | None]) -> bool:
+    """Whether the storage asked for is the one that coefficients have without it."""
+    field = fields.get((way[0], way[1], None))
+    return way[2] is not None and field is not None and str(field.coefficients.values.dtype) == f"torch.{way[2]}"
+
+
+def _points_along_rays(part: Tensor) -> Tensor:
+    """Points at half a voxel from one another along rays, as a renderer or a resampler visits them."""
+    generator = torch.Generator().manual_seed(0)
+    size = torch.tensor([float(n - 1) for n in reversed(part.shape)])
+    start = torch.rand(_RAYS, 1, 3, generator=generator) * size
+    direction = torch.randn(_RAYS, 1, 3, generator=generator)
+    along = 0.5 * torch.arange(_SAMPLES, dtype=torch.float32)[:, None]
+    points = start + along * direction / direction.norm(dim=-1, keepdim=True)
+    return points.clamp_min(0).minimum(size).reshape(-1, 3).to(part.device)
+
+
+def _rounding(field: GridField, exact: GridField, points: Tensor) -> tuple[float, float]:
+    """RMS of value and gradient that the storage of `field` adds to `exact`."""
+    if field is exact:
+        return 0.0, 0.0
+    (v, g), (w, h) = (f.value_and_gradient(points) for f in (field, exact))
+    return float(metrics.rms(v, w)), float(metrics.rms(g, h, vectors=True))
+
+
+def _memory_of_whole(field: GridField, volume: Volume) -> int:
+    """Bytes of the coefficients of all of the volume, padded as those of its part are."""
+    values = field.coefficients.values
+    pads = [n - m for n, m in zip(values.shape, reversed(field.coefficients.size), strict=True)]
+    padded = [n + pad for n, pad in zip(volume.shape[-3:], pads, strict=True)]
+    return math.prod(volume.shape[:-3]) * math.prod(padded) * values.dtype.itemsize
