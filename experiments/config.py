@@ -18,6 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 import filterlab as fl
 from filterlab import signals
 from filterlab.fields.base import Domain
+from filterlab.fields.storage import StorageName
 from filterlab.io import VolumeHeader, describe, load_volume
 from filterlab.io.config import ConfigError, Problem, StrictModel, load_config, unknown_name
 from filterlab.io.volumes import files_of
@@ -52,7 +53,7 @@ class Recipe(StrictModel):
     gradient: Literal["analytic", "central"] | None = None
     scheme: Literal["direct", "fused", "eight_trilinear"] | None = None
     sampler: Literal["exact", "texture_unit"] = "exact"
-    storage: Literal["float64", "float32", "float16", "bfloat16", "int16", "int8", "uint8"] | None = None
+    storage: StorageName | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -215,10 +216,12 @@ class VolumeChoice(StrictModel):
     @property
     def present(self) -> bool:
         """Whether it counts: it is there, or it has to be."""
-        try:
-            return bool(volume_path(self.file)) or not self.optional
-        except ValueError:
-            return not self.optional
+        if self.optional:
+            try:
+                volume_path(self.file)
+            except ValueError:
+                return False
+        return True
 
     def extent(self) -> float:
         """Voxels along an axis, the geometric mean of the three; 128 where the file can't be read here."""

@@ -10,13 +10,16 @@ becomes a field:
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from filterlab.ops import autograd
 
-CHOICES = ("refuse", "propagate", "fill")
+NanChoice = Literal["refuse", "propagate", "fill"]
+CHOICES: tuple[str, ...] = get_args(NanChoice)
 
 
 def resolved(samples: Tensor, choice: str) -> tuple[Tensor, Tensor | None]:

@@ -36,7 +36,7 @@ from filterlab.kernels import Kernel, PiecewisePolynomial
 from filterlab.methods import Method, as_method
 from filterlab.ops.stencil import Product, Row
 from filterlab.prefilters import Prefilter
-from filterlab.spectrum import half_voxel_quadrature
+from filterlab.spectrum import correlation_samples
 
 INNER = 0.9  # of the box along every axis: where errors are averaged
 _SHELLS = 4  # between half the Nyquist frequency and it; there the fall of a spectrum is measured
@@ -278,7 +278,7 @@ def _differentiated(product: Product, axis: int) -> Kernel:
 
 
 def _correlations(p: Kernel, q: Kernel, omega: Tensor) -> Tensor:
-    """Σ_k p̂(ω+2πk) q̂(ω+2πk)* = Σ_n e^{−iωn} ∫ p(x + n) q(x) dx, by exact quadrature."""
+    """Σ_k p̂(ω+2πk) q̂(ω+2πk)* = Σ_n e^{−iωn} ∫ p(x + n) q(x) dx."""
     total = torch.zeros_like(omega, dtype=torch.complex128)
     for n, r in _correlation_samples(p, q).items():
         total = total + r * torch.exp(-1j * n * omega)
@@ -287,6 +287,4 @@ def _correlations(p: Kernel, q: Kernel, omega: Tensor) -> Tensor:
 
 @lru_cache(maxsize=1024)
 def _correlation_samples(p: Kernel, q: Kernel) -> dict[int, float]:
-    x, weights = half_voxel_quadrature(q.support, torch.device("cpu"))
-    reach = (p.support + q.support + 1) // 2
-    return {n: float((p(x + n) * q(x) * weights).sum()) for n in range(-reach, reach + 1)}
+    return correlation_samples(p, q)  # kept: exact kernels don't change

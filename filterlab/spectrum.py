@@ -70,13 +70,13 @@ def measured_response(
     volume = samples.expand(3, 3, -1)
     gradient = method.sampled_gradient if scheme == "eight_trilinear" else None
     field = reconstruct(volume, method, boundary=Boundary.WRAP, prefilter=prefilter, scheme=scheme, gradient=gradient)
-    x, weights = half_voxel_quadrature(2 * reach, omega.device)
+    x, weights = _half_voxel_quadrature(2 * reach, omega.device)
     impulse = _mean_over_a_voxel(field, x + reach)
     phases = torch.cos(omega.to(torch.float64)[..., None] * x)  # h is even: its transform is real
     return (phases * (impulse * weights)).sum(-1)
 
 
-def half_voxel_quadrature(length: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def _half_voxel_quadrature(length: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Nodes and weights on [−length/2, length/2], `NODES` on every half voxel (kernels have knots at half-integers)."""
     t, w = np.polynomial.legendre.leggauss(NODES)
     starts = np.arange(-length, length) / 2
@@ -151,10 +151,15 @@ def _whole_integral(p: PiecewisePolynomial, q: PiecewisePolynomial, prefilter: P
 
 
 def _correlation_spectrum(p: PiecewisePolynomial, q: PiecewisePolynomial, omega: Tensor) -> Tensor:
-    """Σ_n cos(nω) ∫ p(x) q(x + n) dx: the sampled cross-correlation of two even kernels, by exact quadrature."""
-    reach = (p.support + q.support + 1) // 2
-    x, w = half_voxel_quadrature(p.support, omega.device)
+    """Σ_n cos(nω) ∫ p(x + n) q(x) dx: the sampled cross-correlation of two even kernels."""
     total = torch.zeros_like(omega)
-    for n in range(-reach, reach + 1):
-        total = total + float((p(x) * q(x + n) * w).sum()) * torch.cos(n * omega)
+    for n, r in correlation_samples(p, q).items():
+        total = total + r * torch.cos(n * omega)
     return total
+
+
+def correlation_samples(p: PiecewisePolynomial, q: PiecewisePolynomial) -> dict[int, float]:
+    """∫ p(x + n) q(x) dx for every integer n where it is not 0, by exact quadrature."""
+    x, weights = _half_voxel_quadrature(q.support, torch.device("cpu"))
+    reach = (p.support + q.support + 1) // 2
+    return {n: float((p(x + n) * q(x) * weights).sum()) for n in range(-reach, reach + 1)}

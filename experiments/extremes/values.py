@@ -9,7 +9,7 @@ from torch import Tensor
 import filterlab as fl
 from experiments.extremes.contract import Case, Finding, Subject, Tally
 from experiments.extremes.coordinates import SWEEP, field_of, largest, points_inside, refusal, samples_on
-from filterlab.fields.storage import FLOATING, INTEGER, STORAGE
+from filterlab.fields.storage import STORAGE
 from filterlab.fields.tensor_product import Direct
 from filterlab.render.bricks import bound
 
@@ -136,9 +136,8 @@ def _norm(subject: Subject) -> float:
 
 def _rounding(values: Tensor, dtype: torch.dtype) -> float:
     """The largest rounding of a coefficient; of integers twice half a step, as 0 is kept exact."""
-    if dtype in FLOATING:
+    if dtype.is_floating_point:
         return float(values.abs().max()) * torch.finfo(dtype).eps
-    assert dtype in INTEGER
     info = torch.iinfo(dtype)
     return float(values.max() - values.min()) / (info.max - info.min)
 

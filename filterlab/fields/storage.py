@@ -12,13 +12,13 @@ lies outside under the boundary `zeros` stays 0.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-FLOATING = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
-INTEGER = (torch.int16, torch.int8, torch.uint8)
-STORAGE = {str(dtype).removeprefix("torch."): dtype for dtype in (*FLOATING, *INTEGER)}
+StorageName = Literal["float64", "float32", "float16", "bfloat16", "int16", "int8", "uint8"]
+STORAGE: dict[str, torch.dtype] = {name: getattr(torch, name) for name in get_args(StorageName)}
 """Names and types in which coefficients may be stored."""
 
 

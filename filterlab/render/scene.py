@@ -25,10 +25,12 @@ from torch import Tensor
 from filterlab import signals
 from filterlab.fields.base import Domain
 from filterlab.fields.base import Field as FilterlabField
+from filterlab.fields.storage import StorageName
 from filterlab.io.bounded import VolumeFileError
 from filterlab.io.config import StrictModel, load_config, unknown_name
 from filterlab.io.volumes import describe, load_volume
 from filterlab.methods import METHODS, reconstruct
+from filterlab.missing_values import NanChoice
 from filterlab.recommendation import recommend, report
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
 from filterlab.render.dvr import Progress, render
@@ -207,8 +209,8 @@ class Reconstruction(StrictModel):
     boundary: Annotated[str, AfterValidator(_known_boundary)] = "mirror"
     gradient: str | None = None
     sampler: Literal["exact", "texture_unit"] = "exact"
-    storage: Literal["float64", "float32", "float16", "bfloat16", "int16", "int8", "uint8"] | None = None
-    nan: Literal["refuse", "propagate", "fill"] = "refuse"
+    storage: StorageName | None = None
+    nan: NanChoice = "refuse"
 
     @model_validator(mode="before")
     @classmethod
