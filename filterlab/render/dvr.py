@@ -2,7 +2,7 @@
 
     rays ─▶ (t_near, t_far) ─▶ samples ─▶ transfer function ─▶ shading ─▶ compositing
 
-What is done here: cameras and rays, and where rays enter and leave the field; tiles of rays; the background. Along the
+What is done here: cameras and rays, and where rays enter and leave the field; parts of them; the background. Along the
 rays goes a *marcher*: the fused one (`render.fused`, vector code) for fields whose scheme is "fused", where it can run
 as asked, else the plain one (`render.plain`, torch) for any field. The image does not depend on which.
 
@@ -29,12 +29,13 @@ from filterlab.render.fused import FusedMarcher, why_not_fused
 from filterlab.render.plain import Chords, Marcher, Medium, PlainMarcher, rays_at_once
 from filterlab.render.rays import Region, check_rays, check_region, intersect, jitter, segment_count
 from filterlab.render.shading import Shading
+from filterlab.render.tiles import tiled
 from filterlab.render.transfer import TransferFunction, absorbed
 
 Rays = tuple[Tensor, Tensor]
 Progress = bool | None | Callable[[int, int], None]
 
-_TILE = 1 << 16  # rays that are cut at a time; more would only leave the caches
+_PART = 1 << 16  # rays that are cut at a time; more would only leave the caches
 _MOST_SEGMENTS = 2.0**62  # of a ray, that can be counted; no limit on the number of samples is as high
 _BYTES_PER_RAY = 256
 _BYTES_PER_RAY_SAVED = 2048  # of the fused marcher while autograd records
@@ -167,9 +168,9 @@ def prepare(
     length = min(asked, 2 * field.domain.diagonal)  # beyond every end there is nothing to cut, only digits to lose
     media = [Medium(one, transfer, shading, length, faint, differentiable) for one in _unbatched(field)]
     cut = _Cut(field.domain, box, length, asked / length, jitter_seed, differentiable)
-    marcher, tile = _marcher(media[0], memory)
+    marcher, at_once = _marcher(media[0], memory)
     with torch.set_grad_enabled(differentiable):
-        parts: Sequence[Tensor | Chords] = view.pixels.split(tile)
+        parts: Sequence[Tensor | Chords] = view.pixels.split(at_once)
         if len(view.pixels) * _BYTES_PER_RAY <= memory:  # else rays are cut again for every image
             parts = [cut(view, pixels) for pixels in parts]
         total = cut.count_all(view, parts, len(media), max_samples)
@@ -210,26 +211,28 @@ class Job:
             torch.set_grad_enabled(self.media[0].differentiable),
             _reporting(progress, self.samples) as report,
         ):
-            done, tiles = 0, []
+            done, parts = 0, []
             for medium in self.media:
                 for part in self._parts:
                     chords = part if isinstance(part, Chords) else self.chords(part)
                     light, depth = self.marcher.march(medium, chords, lambda n, done=done: report(done + n))
                     done += int(chords.count.sum())  # with those that early termination saved
-                    tiles.append(_over(light, depth[:, None], self._background))
+                    parts.append(_over(light, depth[:, None], self._background))
             report(self.samples)
-        return torch.cat(tiles).reshape(*(self._channels or ()), *self._view.shape, 4)
+        marched = torch.cat(parts).reshape(len(self.media), self.pixels, 4)
+        images = torch.empty_like(marched).index_copy(1, self._view.pixels, marched)
+        return images.reshape(*(self._channels or ()), *self._view.shape, 4)
 
 
 def _marcher(medium: Medium, memory: int) -> tuple[Marcher, int]:
     """The fused marcher where it can run as asked, else the plain one; and how many rays go to it at a time."""
     if why_not_fused(medium) is None:
-        if medium.differentiable:  # derivatives by the volume are a volume for every tile
+        if medium.differentiable:  # derivatives by the volume are a volume for every part
             return FusedMarcher(memory), max(memory // _BYTES_PER_RAY_SAVED, 1)
-        return FusedMarcher(memory), max(min(memory // _BYTES_PER_RAY, _TILE), 1)
+        return FusedMarcher(memory), max(min(memory // _BYTES_PER_RAY, _PART), 1)
     at_once = rays_at_once(memory, medium.dtype, medium.differentiable)
-    tile = at_once if medium.differentiable else max(at_once, memory // (4 * _BYTES_PER_RAY))
-    return PlainMarcher(memory), tile
+    part = at_once if medium.differentiable else max(at_once, memory // (4 * _BYTES_PER_RAY))
+    return PlainMarcher(memory), part
 
 
 def _unbatched(field: Field) -> list[Field]:
@@ -254,7 +257,14 @@ class _Selected(Field):
 
 @dataclass(frozen=True)
 class _View:
-    """The rays of an image, numbered; made where they are needed, a tile at a time."""
+    """The rays of an image; made where they are needed, a part at a time.
+
+    Attributes:
+        shape: of the image.
+        pixels: their numbers, in the order in which they are marched.
+        rays: the rays of some pixels.
+        requires_grad: whether derivatives by the rays are asked.
+    """
 
     shape: tuple[int, ...]
     pixels: Tensor
@@ -267,15 +277,16 @@ class _View:
             if size is None:
                 raise ValueError("size=(width, height) is needed with a camera")
             width, height = check_size(size)
-            pixels = torch.arange(width * height, device=device)
+            pixels = tiled(height, width, device)
             return cls((height, width), pixels, lambda p: camera.pixel_rays(p, width, height), camera.requires_grad)
         if size is not None:
             raise ValueError(f"size goes with a camera; rays bring their own shape; got size={size!r}")
         origins, directions = camera
         o, d = (r.reshape(-1, 3).to(device) for r in check_rays(origins, directions))
         requires_grad = o.requires_grad or d.requires_grad
-        pixels = torch.arange(len(o), device=device)
-        return cls(tuple(origins.shape[:-1]), pixels, lambda p: (o[p], d[p]), requires_grad)
+        shape = tuple(origins.shape[:-1])
+        pixels = tiled(*shape, device) if len(shape) == 2 else torch.arange(len(o), device=device)
+        return cls(shape, pixels, lambda p: (o[p], d[p]), requires_grad)
 
 
 @dataclass(frozen=True)
