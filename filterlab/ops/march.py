@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 MAX_LIGHTS = 8
 RAYS_AT_ONCE = 1 << 13  # then progress is reported, and Ctrl-C heard
 
-_RAYS_PER_BLOCK = 16
 _FEWEST_BUCKETED = 16  # inner control points; fewer are compared one by one
 _MOST_BUCKETS = 1 << 12
 _DARK = {torch.float32: 104.5, torch.float64: 746.0}  # optical depth from where e^−τ is 0
@@ -67,23 +66,26 @@ class Transfer:
     unit: float
 
     @cached_property
-    def buckets(self) -> Buckets | None:
-        """Which intervals values are in, by buckets of equal width; None where comparing is as fast."""
-        return _buckets(self.positions.detach(), self.opacities.detach())
+    def steps(self) -> Steps | None:
+        """Of control points at equal steps, or of buckets; None where comparing with every control point is as fast."""
+        positions = self.positions.detach()
+        return _equal_steps(positions) or _buckets(positions, self.opacities.detach())
 
 
 @dataclass(frozen=True)
-class Buckets:
-    """Value v is in bucket (v − low) · scale, rounded down, between the first and the last.
+class Steps:
+    """Value v is in step (v − low) · scale, rounded down, between the first and the last.
 
     Attributes:
-        rows: (B, 8), see `ops.cpu.optics`.
-        low, scale: numbers of the dtype of rows.
+        low, scale: numbers of the dtype of the positions.
+        count: how many steps there are.
+        buckets: (count, 8), see `ops.cpu.optics`; None: the steps are the intervals between control points.
     """
 
-    rows: Tensor
     low: float
     scale: float
+    count: int
+    buckets: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -253,7 +255,9 @@ class March:
 
     def _threads_of_adjoint(self, with_volumes: bool) -> int:
         """One for every so many rays, and no more volumes of derivatives than memory allows."""
-        threads = max(1, min(torch.get_num_threads(), self.rays.count.shape[0] // _RAYS_PER_BLOCK))
+        from filterlab.ops.cpu.traversal import RAYS_OF_A_BLOCK
+
+        threads = max(1, min(torch.get_num_threads(), self.rays.count.shape[0] // RAYS_OF_A_BLOCK))
         if with_volumes:
             threads = min(threads, 1 + cpu.SPLAT_MEMORY // (self.coefficients.numel() * self.dtype.itemsize))
         return threads
@@ -269,7 +273,6 @@ class March:
             height=h,
             start=self.start,
             step=self.step,
-            block=_RAYS_PER_BLOCK,
             per_unit=1 / self.transfer.unit,
             faint=self.faint,
             opaque=self.opaque,
@@ -285,9 +288,10 @@ class March:
             **(self._lit() if self.lighting else {}),
             **arrays,
         }
-        if (buckets := self.transfer.buckets) is not None:
-            inputs["buckets"] = buckets.rows
-            job.bucket_low, job.bucket_scale, job.bucket_last = buckets.low, buckets.scale, len(buckets.rows) - 1
+        if (steps := self.transfer.steps) is not None:
+            job.steps_low, job.steps_scale, job.steps_last = steps.low, steps.scale, steps.count - 1
+            if steps.buckets is not None:
+                inputs["buckets"] = steps.buckets
         if self.bricks is not None:
             inputs["bricks"] = self.bricks.distance
             job.edge = self.bricks.edge
@@ -312,12 +316,13 @@ class March:
         """Let the threads loose on one portion of the rays after the other."""
         from filterlab.ops.cpu import compiler
         from filterlab.ops.cpu import threads as pool
+        from filterlab.ops.cpu.traversal import RAYS_OF_A_BLOCK
 
         function = compiler.compiled(self._recipe(gradients))
         rays = self.rays.count.shape[0]
         for first in range(0, rays, RAYS_AT_ONCE):
             job.first, job.last = first, min(first + RAYS_AT_ONCE, rays)
-            job.stride = job.chunks = -(-(job.last - first) // job.block)
+            job.stride = job.chunks = -(-(job.last - first) // RAYS_OF_A_BLOCK)
             job.next = 0
             pool.run(function, [job] * max(1, min(torch.get_num_threads(), job.chunks)))
             report(job.last)
@@ -348,7 +353,7 @@ class March:
             self.lighting is not None,
             self.lighting.lights if self.lighting else 0,
             self.bricks is not None,
-            self.transfer.buckets is not None,
+            _way_to_intervals(self.transfer.steps),
             cpu._ARITHMETIC[self.dtype],
             STORAGE[self.coefficients.dtype],
             2 * cpu._lanes(compiler.features(), self.dtype.itemsize),
@@ -359,7 +364,28 @@ def _copy(job: Job) -> Job:
     return type(job).from_buffer_copy(job)
 
 
-def _buckets(x: Tensor, alpha: Tensor) -> Buckets | None:
+def _way_to_intervals(steps: Steps | None) -> str:
+    """One of `ops.cpu.optics.WAYS`."""
+    if steps is None:
+        return "compared"
+    return "even" if steps.buckets is None else "bucketed"
+
+
+def _equal_steps(x: Tensor) -> Steps | None:
+    """The intervals, if every control point starts its own step exactly, as computed in its dtype.
+
+    Rounding is monotonic, so that no value lands on the wrong side of a control point then.
+    """
+    count = len(x) - 1
+    if count < 1:
+        return None
+    scale = (count / (x[-1].double() - x[0].double())).to(x.dtype)
+    if not torch.equal((x - x[0]) * scale, torch.arange(count + 1, dtype=x.dtype)):
+        return None
+    return Steps(float(x[0]), float(scale), count)
+
+
+def _buckets(x: Tensor, alpha: Tensor) -> Steps | None:
     """As few buckets as have no more than one inner control point each, at most `_MOST_BUCKETS`."""
     inner = x[1:-1]
     if len(inner) < _FEWEST_BUCKETED:
@@ -375,7 +401,7 @@ def _buckets(x: Tensor, alpha: Tensor) -> Buckets | None:
             first = torch.searchsorted(own, numbers)  # inner control points before the bucket
             ends = torch.stack([t[(first + k).clamp_max(len(x) - 1)] for t in (x, alpha) for k in range(3)], -1)
             rows = torch.cat((ends[:, :3], first[:, None].to(x.dtype), ends[:, 3:], torch.zeros_like(ends[:, :1])), -1)
-            return Buckets(rows, float(low), float(scale))
+            return Steps(float(low), float(scale), len(rows), rows)
         count *= 2
     return None
 
@@ -390,5 +416,5 @@ def _tables(transfer: Transfer) -> dict[str, Tensor]:
     return {
         "inner": x[1:-1] if len(x) > 2 else x,
         "opacities": torch.stack((x[:-1], x[1:], alpha[:-1], alpha[1:]), -1),
-        "colors": torch.cat((colors, colors.new_zeros(len(colors), 2)), -1),
+        "colors": torch.cat((colors, torch.stack((alpha[:-1], alpha[1:]), -1)), -1),
     }

@@ -108,6 +108,34 @@ def test_missing_says_what() -> None:
     assert "got torch.float16" in str(why(dtype=torch.float16))
 
 
+@pytest.mark.parametrize(("points", "dtype"), [(2, torch.float32), (256, torch.float32), (129, torch.float64)])
+def test_equal_steps_put_no_value_on_the_wrong_side_of_a_control_point(points: int, dtype: torch.dtype) -> None:
+    x = torch.linspace(0, 1, points, dtype=torch.float64).to(dtype)
+    steps = march.Transfer(x, x.new_zeros(points, 3), x, 1.0).steps
+    assert steps is not None
+    assert steps.buckets is None
+    assert steps.count == points - 1
+    below, above = (torch.nextafter(x[1:-1], torch.full_like(x[1:-1], to)) for to in (-math.inf, math.inf))
+    t = torch.stack([(v - steps.low) * steps.scale for v in (below, x[1:-1], above)])
+    own = torch.arange(1, points - 1)
+    assert torch.equal(t[1], own.to(dtype))  # at a control point the fraction is 0, its opacity exact
+    assert bool((t[0] <= own).all())
+    assert bool((t[2] >= own).all())
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        torch.linspace(0, 1, 100),  # 7/99 · 99 is not 7 in float32
+        torch.linspace(-1000, 3000, 256),
+        torch.tensor([0.0, 0.25, 0.75, 1.0]),
+        torch.tensor([0.5]),
+    ],
+)
+def test_steps_that_are_not_equal_exactly_are_not_taken_for_equal(x: torch.Tensor) -> None:
+    assert march._equal_steps(x) is None
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("spacing", ["equal", "random", "clustered"])
 def test_buckets_find_the_interval_that_comparing_finds(spacing: str, dtype: torch.dtype) -> None:
@@ -126,8 +154,10 @@ def test_buckets_find_the_interval_that_comparing_finds(spacing: str, dtype: tor
     near = torch.cat([torch.nextafter(x, torch.full_like(x, to)) for to in (-math.inf, math.inf)])
     wild = torch.tensor([math.nan, math.inf, -math.inf, 1e30, -1e30], dtype=dtype)
     v = torch.cat((x, near, wild, torch.rand(5000, generator=generator).to(dtype) * 4 - 1.5))
-    number = ((v - buckets.low) * buckets.scale).nan_to_num(0).clamp(0, len(buckets.rows) - 1).long()
-    row = buckets.rows[number]
+    assert buckets.buckets is not None
+    assert len(buckets.buckets) == buckets.count
+    number = ((v - buckets.low) * buckets.scale).nan_to_num(0).clamp(0, buckets.count - 1).long()
+    row = buckets.buckets[number]
     beyond = (v >= row[:, 1]).long()
     found = row[:, 3].long() + beyond
     expected = (v[:, None] >= x[1:-1]).sum(-1)

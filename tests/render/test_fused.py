@@ -98,7 +98,7 @@ def test_peaks_regions_and_steps(shading: Shading | None, dtype: torch.dtype) ->
 
 @pytest.mark.parametrize("points", [1, 2, 40, 300])
 def test_any_number_of_control_points(points: int) -> None:
-    x = torch.linspace(0.2, 0.8, points, dtype=torch.float64)
+    x = torch.linspace(0.2, 0.8, points, dtype=torch.float64)  # not at equal steps exactly, but for 2
     generator = torch.Generator().manual_seed(points)
     rgb, alpha = (torch.rand(points, *more, generator=generator, dtype=torch.float64) for more in ((3,), ()))
     assert_same(both(samples(torch.float64), transfer=TransferFunction(x, rgb, alpha, 9.0), dtype=torch.float64))
@@ -122,6 +122,28 @@ def test_buckets_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
         results.append([image, *torch.autograd.grad(image.square().sum(), [volume, *tables], retain_graph=True)])
     for bucketed, searched in zip(*results, strict=True):
         assert torch.equal(bucketed, searched)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_equal_steps_give_what_comparing_gives(monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype) -> None:
+    """The image and its derivatives: intervals are counted off, or found by comparing with every control point."""
+    generator = torch.Generator().manual_seed(2)
+    x = torch.linspace(0, 1, 9, dtype=dtype)
+    table = (x, *(torch.rand(9, *more, generator=generator, dtype=dtype) for more in ((3,), ())))
+    volume = samples(dtype).requires_grad_()
+    field = reconstruct(volume, "triquadratic", scheme="fused")
+    camera = OrthographicCamera.framing(field.domain, (0.2, 1, 0.3))
+    assert march._equal_steps(x) is not None
+    results = []
+    for found in (march._equal_steps, lambda x: None):
+        monkeypatch.setattr(march, "_equal_steps", found)
+        leaves = [t.clone().requires_grad_() for t in table]
+        image = render(field, camera, TransferFunction(*leaves, 9.0), size=(9, 7), shading=LIT, dtype=dtype)
+        results.append([image, *torch.autograd.grad(image.square().sum(), [volume, *leaves], retain_graph=True)])
+    for counted, compared in zip(*results, strict=True):
+        size = float(compared.detach().abs().max())
+        assert float((counted - compared).detach().abs().max()) <= 100 * torch.finfo(dtype).eps * size
+        assert size > 0
 
 
 def test_values_at_control_points_are_exact() -> None:

@@ -63,11 +63,10 @@ _WHOLE = 1.5 * 2.0**52
 
 
 class Variable:
-    """A place on the stack; LLVM makes phis of it, and registers."""
+    """A place in memory; of those on the stack LLVM makes phis, and registers."""
 
-    def __init__(self, builder: ir.IRBuilder, slot: Value, initial: Value) -> None:
-        self._builder, self._slot, self._type = builder, slot, initial.type
-        self.value = initial
+    def __init__(self, builder: ir.IRBuilder, slot: Value, kind: ir.Type) -> None:
+        self._builder, self._slot, self._type = builder, slot, kind
 
     @property
     def value(self) -> Value:
@@ -181,17 +180,23 @@ class Lanes:
         whole = self.constant(_WHOLE)
         return self.subtract(self.of_bits(self.builder.add(a, self.bits_of(whole))), whole)
 
-    def delayed(self, a: Value, by: int) -> Value:
-        """Lane i gets what lane i − by has; zeros come in at the start."""
-        return self.shuffle(
-            self.constant(0), a, [lane if lane < by else self.count + lane - by for lane in range(self.count)]
-        )
+    def delayed(self, a: Value, by: int, first: float = 0.0) -> Value:
+        """Lane i gets what lane i − by has; `first` comes in at the start."""
+        pattern = [lane if lane < by else self.count + lane - by for lane in range(self.count)]
+        return self.shuffle(self.constant(first), a, pattern)
 
     def running_sums(self, a: Value) -> Value:
         """Lane i gets the sum of lanes 0 … i, in log₂P steps."""
         by = 1
         while by < self.count:
             a, by = self.add(a, self.delayed(a, by)), 2 * by
+        return a
+
+    def running_products(self, a: Value) -> Value:
+        """Lane i gets the product of lanes 0 … i, in log₂P steps."""
+        by = 1
+        while by < self.count:
+            a, by = self.multiply(a, self.delayed(a, by, first=1)), 2 * by
         return a
 
     def total(self, a: Value) -> Value:
@@ -222,6 +227,10 @@ class Lanes:
         """To 32 bits."""
         return self.builder.fptosi(a, ir.VectorType(I32, self.count))
 
+    def of_integer(self, a: Value) -> Value:
+        """From 32 bits."""
+        return self.builder.sitofp(a, self.pack)
+
     def widen(self, a: Value) -> Value:
         """Integers that are not negative, to 64 bits."""
         return self.builder.zext(a, ir.VectorType(I64, self.count))
@@ -242,6 +251,11 @@ class Lanes:
             width = range(2 * vectors[0].type.count)
             vectors = [self.shuffle(a, b, width) for a, b in zip(vectors[::2], vectors[1::2], strict=True)]
         return vectors[0]
+
+    def halves(self, pack: Value) -> list[Value]:
+        """The first and the second half of the lanes; `join` puts them together again."""
+        half = self.count // 2
+        return [self.shuffle(pack, pack, range(first, first + half)) for first in (0, half)]
 
     def transpose(self, packs: Sequence[Value]) -> list[Value]:
         """P packs as the rows of a P×P table -> its columns.
@@ -384,7 +398,13 @@ class Lanes:
         """A value that changes in a loop."""
         with self.builder.goto_entry_block():
             slot = self.builder.alloca(initial.type)
-        return Variable(self.builder, slot, initial)
+        variable = Variable(self.builder, slot, initial.type)
+        variable.value = initial
+        return variable
+
+    def at(self, address: Value, kind: ir.Type) -> Variable:
+        """What lies at an address."""
+        return Variable(self.builder, address, kind)
 
     def copy(self, target: Value, source: Value, size: Value) -> None:
         """`size` bytes."""

@@ -7,12 +7,16 @@ lights, l the direction to a light, h halfway between it and the viewer. Same me
 A transfer function is two tables with one row per interval between control points. Every lane looks up its own row:
 
     positions and opacities   x₀ x₁ α₀ α₁
-    colours                   r₀ r₁ g₀ g₁ │ b₀ b₁ – –
+    colours and opacities     r₀ r₁ g₀ g₁ │ b₀ b₁ α₀ α₁
 
-The interval is found by comparing v with all inner control points one after the other: three instructions per control
-point for a whole register, measured as 0.035 ns per sample and control point (AVX2). Where there are many, v is first
-put into one of many buckets of equal width that have one inner control point each, or none. A third table says what a
-bucket has: the two intervals that meet at its control point x₁, and the number j of the first,
+There are three ways to find the interval (`WAYS`). Control points at equal steps, as look-up tables from 0 to 1 have
+them, need no positions: with t = (v − low) · scale the interval is ⌊t⌋ and w = t − ⌊t⌋, and the second table says all
+else. They are taken for equal only where (x − low) · scale is a whole number at each of them, rounding included.
+
+Else v is compared with all inner control points one after the other: three instructions per control point for a whole
+register, measured as 0.035 ns per sample and control point (AVX2). Where there are many, v is first put into one of
+many buckets of equal width that have one inner control point each, or none. A third table says what a bucket has: the
+two intervals that meet at its control point x₁, and the number j of the first,
 
     x₀ x₁ x₂ j │ α₀ α₁ α₂ –
 
@@ -41,6 +45,9 @@ from filterlab.ops.cpu.taps import _lanes_of_groups, _transpose_quads
 
 OPACITY_ROW, COLOR_ROW, BUCKET_ROW = 4, 8, 8  # numbers of a row
 
+WAYS = ("even", "compared", "bucketed")
+"""How the interval of a value is found."""
+
 
 @dataclass(frozen=True)
 class Located:
@@ -50,11 +57,13 @@ class Located:
         interval: number of the row, 32-bit integers.
         ends: x₀ x₁ α₀ α₁.
         fraction: w.
+        blue: b₀ b₁, if they were read with the opacities.
     """
 
     interval: Value
     ends: list[Node]
     fraction: Node
+    blue: list[Value] | None = None
 
     def colored(self, lanes: Lanes) -> Value:
         """A mask: the interval has an opacity other than 0 at one of its ends."""
@@ -62,10 +71,9 @@ class Located:
 
 
 @dataclass(frozen=True)
-class Buckets:
-    """Address of the table, and as numbers (doubles) the start of the first bucket, 1/width, and the last's number."""
+class Steps:
+    """Equal steps, of control points or of buckets: low, 1/width and the number of the last one, as doubles."""
 
-    rows: Value
     low: Value
     scale: Value
     last: Value
@@ -75,30 +83,59 @@ class TransferTable:
     """The transfer function in memory.
 
     Args:
+        way: of `WAYS`.
         inner: address of the control points between the first and the last, `intervals` − 1 of them.
-        opacities, colors: addresses of the two tables.
-        buckets: the third table; None: control points are compared one after the other.
+        opacities, colors, buckets: addresses of the three tables.
+        steps: of "even" intervals or of buckets.
     """
 
     def __init__(
         self,
         lanes: Lanes,
+        way: str,
         inner: Value,
         opacities: Value,
         colors: Value,
         intervals: Value,
-        buckets: Buckets | None = None,
+        buckets: Value,
+        steps: Steps,
     ) -> None:
-        self.lanes, self.inner, self.intervals = lanes, inner, intervals
-        self.opacities, self.colors, self.buckets = opacities, colors, buckets
+        self.lanes, self.way, self.inner, self.intervals = lanes, way, inner, intervals
+        self.opacities, self.colors, self.buckets, self.steps = opacities, colors, buckets, steps
 
     def locate(self, tape: Tape, value: Node) -> Located:
         """A NaN is looked up in the first interval, where its fraction is NaN."""
-        interval, packs = self._search(value.value) if self.buckets is None else self._in_bucket(value.value)
+        if self.way == "even":
+            return self._at_equal_steps(tape, value)
+        interval, packs = self._search(value.value) if self.way == "compared" else self._in_bucket(value.value)
         ends = [Node(pack) for pack in packs]
         low, high, _, _ = ends
         fraction = tape.divide(tape.subtract(value, low), tape.subtract(high, low))
         return Located(interval, ends, tape.clamp_fraction(fraction))
+
+    def _at_equal_steps(self, tape: Tape, value: Node) -> Located:
+        e = self.lanes
+        interval, t = self._step_of(value.value)
+        number, scale = e.of_integer(interval), e.everywhere(e.scalar(self.steps.scale))
+        b0, b1, *opacities = self._rows(self.colors, interval, COLOR_ROW, 4)
+        width = e.divide(e.constant(1), scale)
+        first = e.multiply_add(number, width, e.everywhere(e.scalar(self.steps.low)))
+        ends = [Node(pack) for pack in (first, e.add(first, width), *opacities)]
+        w = e.subtract(t, number)
+        fraction = tape.record(
+            w,
+            (value, scale),
+            (ends[0], e.multiply(e.subtract(w, e.constant(1)), scale)),
+            (ends[1], e.negate(e.multiply(w, scale))),
+        )
+        return Located(interval, ends, tape.clamp_fraction(fraction), [b0, b1])
+
+    def _step_of(self, value: Value) -> tuple[Value, Value]:
+        """The number of a value's step, and t = (v − low) · scale."""
+        e = self.lanes
+        low, scale, last = (e.everywhere(e.scalar(n)) for n in (self.steps.low, self.steps.scale, self.steps.last))
+        t = e.multiply(e.subtract(value, low), scale)
+        return e.to_integer(e.clamp(t, e.constant(0), last)), t
 
     def _search(self, value: Value) -> tuple[Value, list[Value]]:
         """The interval and its ends, by comparing with every control point."""
@@ -113,12 +150,10 @@ class TransferTable:
 
     def _in_bucket(self, value: Value) -> tuple[Value, list[Value]]:
         """The same, by comparing with the one control point of the bucket."""
-        e, b, buckets = self.lanes, self.lanes.builder, self.buckets
-        assert buckets is not None
-        low, scale, last = (e.everywhere(e.scalar(n)) for n in (buckets.low, buckets.scale, buckets.last))
-        bucket = e.to_integer(e.clamp(e.multiply(e.subtract(value, low), scale), e.constant(0), last))
-        x0, x1, x2, number = self._rows(buckets.rows, bucket, BUCKET_ROW, 0)
-        alpha0, alpha1, alpha2, _ = self._rows(buckets.rows, bucket, BUCKET_ROW, 4)
+        e, b = self.lanes, self.lanes.builder
+        bucket, _ = self._step_of(value)
+        x0, x1, x2, number = self._rows(self.buckets, bucket, BUCKET_ROW, 0)
+        alpha0, alpha1, alpha2, _ = self._rows(self.buckets, bucket, BUCKET_ROW, 4)
         beyond = b.fcmp_ordered(">=", value, x1)
         first, second = (x0, x1, alpha0, alpha1), (x1, x2, alpha1, alpha2)
         ends = [e.where(beyond, right, left) for left, right in zip(first, second, strict=True)]
@@ -129,8 +164,9 @@ class TransferTable:
 
     def color_ends(self, located: Located) -> list[Node]:
         """r₀ r₁ g₀ g₁ b₀ b₁."""
-        halves = [self._rows(self.colors, located.interval, COLOR_ROW, first) for first in (0, 4)]
-        return [Node(pack) for pack in (halves[0] + halves[1])[:6]]
+        red_green = self._rows(self.colors, located.interval, COLOR_ROW, 0)
+        blue = located.blue or self._rows(self.colors, located.interval, COLOR_ROW, 4)[:2]
+        return [Node(pack) for pack in red_green + blue]
 
     def color(self, tape: Tape, located: Located, ends: Sequence[Node]) -> list[Node]:
         return [tape.blend(ends[k], ends[k + 1], located.fraction) for k in (0, 2, 4)]
