@@ -186,6 +186,11 @@ class March:
         """By how much a point may be rounded, in voxels."""
         return _SLACK[self.dtype] * (abs(self.start) + max(self.coefficients.shape))
 
+    @cached_property
+    def _readable(self) -> Tensor:
+        """The coefficients as they are read."""
+        return self.coefficients.detach().resolve_neg().contiguous()
+
     @torch.no_grad()
     def run(self, report: Callable[[int], None] = lambda rays: None) -> tuple[Tensor, Tensor]:
         """Light (R, 3) and optical depth (R,), float64. `report` is given the number of rays done, now and then."""
@@ -282,7 +287,7 @@ class March:
             setattr(job, f"high_{axis}", self.start + size - support)
         job.intervals = max(len(self.transfer.positions) - 1, 1)
         inputs = {
-            "coefficients": self.coefficients,
+            "coefficients": self._readable,
             **{name: getattr(self.rays, name) for name in ("entry", "direction", "length", "offset", "count")},
             **_tables(self.transfer),
             **(self._lit() if self.lighting else {}),
@@ -356,6 +361,7 @@ class March:
             _way_to_intervals(self.transfer.steps),
             cpu._ARITHMETIC[self.dtype],
             STORAGE[self.coefficients.dtype],
+            cpu.has_room(self._readable),
             2 * cpu._lanes(compiler.features(), self.dtype.itemsize),
         )
 

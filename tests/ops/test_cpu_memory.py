@@ -11,13 +11,9 @@ import sys
 
 import pytest
 
-CHECK = r'''
+GUARDED = r'''
 import ctypes, itertools, mmap
 import torch
-from filterlab.fields.ncrsi import NCRSI_TERMS
-from filterlab.fields.tensor_product import Direct
-from filterlab.kernels import CATMULL_ROM, LINEAR, bspline
-from filterlab.ops import Stencil, cpu, gather
 
 PAGE = mmap.PAGESIZE
 libc = ctypes.CDLL(None, use_errno=True)
@@ -38,6 +34,14 @@ def guarded(tensor, at_end):
     return copy
 
 torch.manual_seed(0)
+'''
+
+POINTS = r"""
+from filterlab.fields.ncrsi import NCRSI_TERMS
+from filterlab.fields.tensor_product import Direct
+from filterlab.kernels import CATMULL_ROM, LINEAR, bspline
+from filterlab.ops import Stencil, cpu, gather
+
 wild = torch.tensor([0.0, -0.0, 1e30, -1e30, float("inf"), -float("inf"), float("nan"), 3e9, -3e9, 1e10, 2**31, -2**31,
                      2**24, 6.5, 1e-45])
 jets = [(LINEAR,) * 3, (bspline(2),) * 3, (bspline(5),) * 3, (bspline(0), CATMULL_ROM, bspline(4))]
@@ -69,13 +73,47 @@ for stencil, (dtype, stored) in cases:
                 cpu._run("scatter", [room[:-1].view_as(coefficients)], points, rows, stencil, 0)
                 assert room[-1] == 0
 print("nothing outside was touched")
-'''
+"""
+
+MARCH = r"""
+from filterlab.kernels import bspline
+from filterlab.ops import Stencil, cpu
+from filterlab.ops.march import March, Rays, Transfer
+
+inside = torch.rand(40, 3, dtype=torch.float64) * 3 + 0.6
+inside[:2] = torch.tensor([[0.5] * 3, [3.5] * 3])
+entry = torch.cat((inside, torch.tensor([[1e30, -1e30, 3.0], [torch.nan, 1.0, torch.inf], [-3e9, 2.0**31, 1e10]])))
+entry = guarded(entry, True)
+direction = torch.nn.functional.normalize(2.0 - entry.nan_to_num(0).clamp(-9, 9) + 1e-3, dim=-1)
+rays = len(entry)
+length = torch.full((rays,), 2.0, dtype=torch.float64)
+x = torch.linspace(0, 1, 5)
+for dtype, stored, at_end, room in itertools.product(
+    (torch.float32, torch.float64), (torch.float32, torch.float64, torch.uint8), (True, False), (0, 1)
+):
+    samples = torch.rand(5 * 5 * 5 + room).mul(1 if stored.is_floating_point else 100).to(stored)
+    volume = guarded(samples, at_end)[:125].view(5, 5, 5)
+    assert cpu.has_room(volume) == bool(room)
+    tables = Transfer(x.to(dtype), torch.rand(5, 3, dtype=dtype), x.to(dtype) / 3, 1.0)
+    own = Rays(entry, direction, length, torch.ones_like(length), torch.full((rays,), 40))
+    march = March(volume, 0, Stencil.jet((bspline(2),) * 3, 0), own, tables, None, 0.05)
+    light, depth = march.run()
+    expected, _ = March(samples[:125].view(5, 5, 5).clone(), *list(vars(march).values())[1:7]).run()
+    assert torch.equal(light[:40], expected[:40])
+    assert light[:40].isfinite().all() and light[:40].max() > 0.1
+    march.adjoint(light, torch.ones_like(light), torch.ones_like(depth), ("coefficients", "rays", "table"))
+print("nothing outside was touched")
+"""
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="guard pages are made with mprotect")
-def test_nothing_outside_the_arrays_is_touched() -> None:
+@pytest.mark.parametrize("check", [POINTS, MARCH], ids=["points", "march"])
+def test_nothing_outside_the_arrays_is_touched(check: str) -> None:
     result = subprocess.run(
-        [sys.executable, "-c", CHECK], env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True
+        [sys.executable, "-c", GUARDED + check],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
     )
     assert result.returncode == 0, f"exit status {result.returncode}: {result.stderr}"
     assert "nothing outside was touched" in result.stdout

@@ -220,7 +220,7 @@ def guarded(shape, dtype, at_end):
 
 shapes = [(1, 1, 1), (2, 3, 5), (9, 8, 7), (3, 65, 4), (4, 3, 79), (2, 2, 3, 3, 17)]
 for at_end in (True, False):
-    cpu._fresh = lambda shape, dtype, make: guarded(shape, dtype, at_end)
+    cpu._fresh = lambda shape, dtype, make, room=0: guarded(shape, dtype, at_end)
     driver._scratch = lambda size: guarded((size,), torch.uint8, at_end).numpy()
     for shape, stored, (boundary, tail) in itertools.product(
         shapes, (torch.float32, torch.float64, torch.uint8), (("mirror", 0), ("zeros", 3))

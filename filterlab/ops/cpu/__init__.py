@@ -229,12 +229,22 @@ def _how_it_folds(boundary: Boundary, n: int) -> str:
     return {Boundary.MIRROR: "reflect", Boundary.REFLECT: "reflect", Boundary.WRAP: "wrap"}.get(boundary, "clamp")
 
 
-def _fresh(shape: Sequence[int], dtype: torch.dtype, make: Callable[..., np.ndarray]) -> Tensor:
+def _fresh(shape: Sequence[int], dtype: torch.dtype, make: Callable[..., np.ndarray], room: int = 0) -> Tensor:
     """A new tensor in memory that numpy allocated: it asks the system for huge pages, torch does not.
 
     Measured on Linux: the first touch of 8 MB costs 0.4 ms instead of 7, as much as a third of a splat of 10⁶ points.
+
+    Args:
+        room: numbers that the storage has behind the tensor.
     """
-    return torch.from_numpy(make(tuple(shape), _ARITHMETIC[dtype]))
+    size = math.prod(shape)
+    return torch.from_numpy(make((size + room,), _ARITHMETIC[dtype]))[:size].view(tuple(shape))
+
+
+def has_room(tensor: Tensor) -> bool:
+    """Whether the storage of a contiguous tensor goes on behind it, by a number at least."""
+    size = tensor.element_size()
+    return tensor.untyped_storage().nbytes() >= (tensor.storage_offset() + tensor.numel() + 1) * size
 
 
 def _zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:

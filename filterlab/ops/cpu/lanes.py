@@ -350,9 +350,9 @@ class Lanes:
     def store(self, value: Value, address: Value) -> None:
         self.builder.store(value, address, align=_size(value.type.element))
 
-    def load_quad(self, address: Value, storage: Storage, taps: int) -> Value:
-        """Three or four numbers as a vector of four; nothing beyond `taps` numbers is read."""
-        if taps == 4:
+    def load_quad(self, address: Value, storage: Storage, taps: int, room: bool) -> Value:
+        """Three or four numbers as a vector of four; nothing beyond `taps` numbers is read, unless there is room."""
+        if taps == 4 or room:
             return self.load(address, storage.raw, 4)
         if storage.bytes < 4:  # machines have no masked loads of bytes and words
             pair = self.load(address, storage.raw, 2)

@@ -103,6 +103,7 @@ class Recipe:
         interval: how a value's interval of the transfer function is found, of `optics.WAYS`.
         arithmetic: "float32" or "float64".
         storage: dtype of the coefficients.
+        room: whether there is a number behind the last coefficient, in the same storage.
         lanes: P.
     """
 
@@ -115,6 +116,7 @@ class Recipe:
     interval: str
     arithmetic: str
     storage: str
+    room: bool
     lanes: int
 
     def generate(self) -> str:
@@ -184,7 +186,7 @@ class _Program:
         e, b = self.lanes, self.builder
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         self.grid = Grid.of(j)
-        self.taps = _Halves(e, self.half, Taps(self.half, self.recipe.stencil, self.storage, self.grid))
+        self.taps = self.of_coefficients(self.recipe.stencil)
         steps = Steps(j.steps_low, j.steps_scale, j.steps_last)
         tables = j.opacities, j.colors, j.intervals, j.buckets
         self.table = TransferTable(e, self.recipe.interval, j.inner, *tables, steps)
@@ -193,6 +195,10 @@ class _Program:
         with frame.every_chunk(e, j) as chunk:
             self.traversal.every_block(chunk, self._march_block)
         b.ret_void()
+
+    def of_coefficients(self, stencil: Lowered) -> _Halves:
+        taps = Taps(self.half, stencil, self.storage, self.grid, self.recipe.room)
+        return _Halves(self.lanes, self.half, taps)
 
     def _march_block(self, first: Value, end: Value) -> None:
         with self.traversal.every_ray(first, end) as (number, state):
@@ -351,9 +357,7 @@ class _Adjoint(_Program):
             self.spreading = _Halves(e, self.half, Taps(self.half, recipe.stencil, number, self.grid))
         if recipe.derivatives is not None:
             self.raised = recipe.derivatives[1]
-            self.differentiating = _Halves(
-                e, self.half, Taps(self.half, recipe.derivatives[0], self.storage, self.grid)
-            )
+            self.differentiating = self.of_coefficients(recipe.derivatives[0])
         self.columns = gradient_columns(recipe.lights if recipe.lit else None)
 
     def wants(self, name: str) -> bool:

@@ -180,7 +180,7 @@ class _Filter:
         pool.run(function, [job] * threads)
 
     def _fresh(self, shape: tuple[int, ...]) -> Tensor:
-        return cpu._fresh(shape, self.dtype, np.empty)
+        return cpu._fresh(shape, self.dtype, np.empty, room=1)  # lines of three coefficients are read as four
 
     def _with_neighbours(self, samples: Tensor) -> Tensor:
         """The samples with neighbours along the last axis lying together."""

@@ -99,12 +99,14 @@ class Taps:
         stencil: what is summed.
         storage: how coefficients lie in memory; for `spread` in the type of the arithmetic.
         grid: where they lie.
+        room: whether the number behind the last coefficient may be read, so that three taps can be read as four.
+            Measured (AVX-512, Zen 5): a march takes 0.97 times the time; jets of points gain nothing.
     """
 
-    def __init__(self, lanes: Lanes, stencil: Lowered, storage: Storage, grid: Grid) -> None:
+    def __init__(self, lanes: Lanes, stencil: Lowered, storage: Storage, grid: Grid, room: bool = False) -> None:
         self.lanes, self.builder = lanes, lanes.builder
         self.stencil, self.storage, self.grid = stencil, storage, grid
-        self.supports = stencil.supports
+        self.supports, self.room = stencil.supports, room
         wide = lanes.count * lanes.bits >= 512
         self.written_at_once = _LINES_AT_ONCE if wide else 1
         self.read_at_once = _LINES_AT_ONCE if wide and len(stencil.rows) <= _ROWS_WITH_LINES else 1
@@ -330,7 +332,7 @@ class Taps:
     def _read(self, tap: Value, piece: _Piece) -> Value:
         e, raw, count = self.lanes, self.storage.raw, len(piece.taps)
         address = self._address(tap, piece)
-        return e.load(address, raw, count) if count <= 2 else e.load_quad(address, self.storage, count)
+        return e.load(address, raw, count) if count <= 2 else e.load_quad(address, self.storage, count, self.room)
 
     def _transposed(self, rows: list[Value], taps: int) -> list[Value]:
         """Every lane's row of taps -> the first tap of every lane, the second of every lane, …"""
