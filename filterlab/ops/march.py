@@ -362,7 +362,7 @@ class March:
             cpu._ARITHMETIC[self.dtype],
             STORAGE[self.coefficients.dtype],
             cpu.has_room(self._readable),
-            2 * cpu._lanes(compiler.features(), self.dtype.itemsize),
+            cpu._lanes(compiler.features(), self.dtype.itemsize),
         )
 
 

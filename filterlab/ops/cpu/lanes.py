@@ -77,6 +77,27 @@ class Variable:
         self._builder.store(value, self._slot)
 
 
+class Kept:
+    """A pack in memory, to be read in parts by a loop."""
+
+    def __init__(self, builder: ir.IRBuilder, place: Value, element: ir.Type) -> None:
+        self._builder, self._place, self._element = builder, place, element
+
+    def part(self, index: Value, count: int) -> Value:
+        """Part number `index` of `count` lanes each."""
+        b = self._builder
+        start = b.gep(self._place, [b.mul(index, I64(count))], source_etype=self._element)
+        return b.load(start, typ=ir.VectorType(self._element, count), align=_size(self._element))
+
+    def set_part(self, index: Value, value: Value) -> None:
+        b = self._builder
+        start = b.gep(self._place, [b.mul(index, I64(value.type.count))], source_etype=self._element)
+        b.store(value, start, align=_size(self._element))
+
+    def all(self, count: int) -> Value:
+        return self.part(I64(0), count)
+
+
 class Lanes:
     """Writes instructions at the end of the current block.
 
@@ -252,10 +273,9 @@ class Lanes:
             vectors = [self.shuffle(a, b, width) for a, b in zip(vectors[::2], vectors[1::2], strict=True)]
         return vectors[0]
 
-    def halves(self, pack: Value) -> list[Value]:
-        """The first and the second half of the lanes; `join` puts them together again."""
-        half = self.count // 2
-        return [self.shuffle(pack, pack, range(first, first + half)) for first in (0, half)]
+    def parts(self, pack: Value, count: int) -> list[Value]:
+        """The first `count` lanes, the next ones, and so on; `join` puts them together again."""
+        return [self.shuffle(pack, pack, range(first, first + count)) for first in range(0, self.count, count)]
 
     def transpose(self, packs: Sequence[Value]) -> list[Value]:
         """P packs as the rows of a P×P table -> its columns.
@@ -405,6 +425,16 @@ class Lanes:
     def at(self, address: Value, kind: ir.Type) -> Variable:
         """What lies at an address."""
         return Variable(self.builder, address, kind)
+
+    def kept(self, pack: Value | None = None) -> Kept:
+        """Memory for a pack, this one or one of this arithmetic that is written in parts."""
+        kind = self.pack if pack is None else pack.type
+        with self.builder.goto_entry_block():
+            place = self.builder.alloca(kind)
+        place.type = POINTER
+        if pack is not None:
+            self.builder.store(pack, place)
+        return Kept(self.builder, place, kind.element)
 
     def copy(self, target: Value, source: Value, size: Value) -> None:
         """`size` bytes."""

@@ -1,15 +1,16 @@
 """The program of the march: rays in, light and optical depth out, all in registers; and its adjoint.
 
-`ops.cpu.traversal` finds segments of a ray that may be seen, a pack at a time. For every pack:
+`ops.cpu.traversal` finds runs of segments that may be seen, which are marched two at a time. For every two:
 
     where       ends, middles and lengths of the segments, in double precision; the middles as points of the grid
     taps        value, and with lights the gradient, from the same taps (`ops.cpu.taps`)
     optics      opacity α and optical depth τ; colour c, lit (`ops.cpu.optics`)
     compose     a_i = 1 − e^{−τ_i}; T_i = e^{−depth} (1 − a_0) … (1 − a_{i−1}), running products over the lanes
-                behind the depth of the packs before; weight w_i = T_i a_i; light += Σ w_i c_i, depth += Σ τ_i
+                of a run behind the depth of the runs before; weight w_i = T_i a_i; light += Σ w_i c_i, depth += Σ τ_i
 
-What changes nothing is not computed: a pack without opacity ends after the look-up of its opacities, one behind an
-opaque medium before its colours.
+What changes nothing is not computed: runs without opacity end after the look-up of their opacities, one behind an
+opaque medium before its colours. Colours and lights take many registers: that is done for one run after the other, and
+so is everything of the adjoint. A run has the lanes of two registers, as the sums over taps fill one.
 
 The adjoint marches the same way again, front to back, and needs nothing but the result: what segment i changes behind
 itself is the rest of the light, known from what has passed. With g the cotangent of the light, γ_i = g · c_i:
@@ -34,7 +35,7 @@ from filterlab.ops.cpu.lanes import DOUBLE, I64, STORAGE, Lanes, Value
 from filterlab.ops.cpu.optics import Lights, Located, Steps, TransferTable, optical_depth, shade
 from filterlab.ops.cpu.tape import Node, Tape
 from filterlab.ops.cpu.taps import Grid, Taps
-from filterlab.ops.cpu.traversal import Ray, Segments, State, Traversal
+from filterlab.ops.cpu.traversal import Ray, Run, Segments, State, Traversal
 from filterlab.ops.derivatives import TABLE_ROW, gradient_columns
 from filterlab.ops.stencil import Lowered
 
@@ -104,7 +105,7 @@ class Recipe:
         arithmetic: "float32" or "float64".
         storage: dtype of the coefficients.
         room: whether there is a number behind the last coefficient, in the same storage.
-        lanes: P.
+        lanes: of a register; a run has twice as many.
     """
 
     gradients: tuple[str, ...]
@@ -126,105 +127,112 @@ class Recipe:
         return str(module)
 
 
-_LocatedTaps = list[tuple[Value, list[Value]]]
-"""For both halves of a pack where their taps are, and their local coordinates."""
+class _Parts:
+    """The sums over taps of a pack, part by part.
 
-
-class _Halves:
-    """The sums over taps of a pack, in halves.
-
-    The sums need most registers, so that a pack of them fills one register with every number. All else is chains of
-    operations that wait for one another; there two registers are worked on at a time. Measured: 0.8 times the time.
+    The sums need most registers, so that a part of them fills one register with every number. All else is chains of
+    operations that wait for one another; there several registers are worked on at a time. A loop goes through the
+    parts: programs that are much longer are slow to read for a processor.
     """
 
-    def __init__(self, lanes: Lanes, half: Lanes, taps: Taps) -> None:
-        self.lanes, self.half, self.taps = lanes, half, taps
+    def __init__(self, lanes: Lanes, part: Lanes, taps: Taps) -> None:
+        self.lanes, self.part, self.taps = lanes, part, taps
         self.supports = taps.supports
+        self.count = I64(lanes.count // part.count)
 
     def cells(self, points: Sequence[Value]) -> list[Value]:
         """Along x, y, z: every lane's first tap, counted from coefficient 0 (32 bits)."""
-        halves = [[cell for cell, _ in self.taps.cells(own)] for own in self._split(points)]
-        return self._joined(halves)
+        split = [self.lanes.parts(own, self.part.count) for own in points]
+        parts = [[cell for cell, _ in self.taps.cells(own)] for own in zip(*split, strict=True)]
+        return [self.part.join(own) for own in zip(*parts, strict=True)]
 
-    def locate(self, points: Sequence[Value]) -> _LocatedTaps:
-        return [self.taps.locate(own) for own in self._split(points)]
-
-    def contract(self, located: _LocatedTaps, volume: Value) -> list[Value]:
+    def contract(self, points: Sequence[Value], volume: Value) -> list[Value]:
         """The rows of the stencil."""
-        halves = []
-        for offset, u in located:
+        e, kept = self.lanes, [self.lanes.kept(own) for own in points]
+        rows = [e.kept() for _ in self.taps.stencil.rows]
+        with e.repeat(I64(0), self.count) as i:
+            offset, u = self.taps.locate([own.part(i, self.part.count) for own in kept])
             addresses = self.taps.addresses(offset, volume)
-            halves.append(self.taps.contract(addresses, I64(0), self.taps.weigh(u), u))
-        return self._joined(halves)
+            found = self.taps.contract(addresses, I64(0), self.taps.weigh(u), u)
+            for row, value in zip(rows, found, strict=True):
+                row.set_part(i, value)
+        return [row.all(e.count) for row in rows]
 
-    def spread(self, located: _LocatedTaps, volume: Value, cotangents: Sequence[Value]) -> None:
+    def spread(self, points: Sequence[Value], volume: Value, cotangents: Sequence[Value]) -> None:
         """The adjoint of that: add into the volume."""
-        for (offset, u), own in zip(located, self._split(cotangents), strict=True):
+        e, kept, given = self.lanes, *([self.lanes.kept(own) for own in packs] for packs in (points, cotangents))
+        with e.repeat(I64(0), self.count) as i:
+            offset, u = self.taps.locate([own.part(i, self.part.count) for own in kept])
+            own = [cotangent.part(i, self.part.count) for cotangent in given]
             self.taps.spread(self.taps.addresses(offset, volume), I64(0), self.taps.weigh(u), own)
-
-    def _split(self, packs: Sequence[Value]) -> list[list[Value]]:
-        return [list(own) for own in zip(*(self.lanes.halves(pack) for pack in packs), strict=True)]
-
-    def _joined(self, halves: Sequence[Sequence[Value]]) -> list[Value]:
-        return [self.half.join(pair) for pair in zip(*halves, strict=True)]
 
 
 class _Program:
-    """What march and adjoint have in common."""
+    """What march and adjoint have in common.
+
+    Attributes:
+        runs: marched at a time.
+        kept: names of what is kept of a ray from run to run.
+    """
+
+    runs: int
+    kept: tuple[str, ...]
 
     def __init__(self, recipe: Recipe, function: ir.Function) -> None:
         self.recipe, self.function = recipe, function
         self.builder = ir.IRBuilder(function.append_basic_block("entry"))
-        self.half = Lanes(self.builder, recipe.arithmetic, recipe.lanes // 2)
-        self.lanes = Lanes(self.builder, recipe.arithmetic, recipe.lanes)
+        self.part = Lanes(self.builder, recipe.arithmetic, recipe.lanes)
+        self.run = Lanes(self.builder, recipe.arithmetic, 2 * recipe.lanes)
+        self.lanes = Lanes(self.builder, recipe.arithmetic, self.runs * self.run.count)
         self.few = Lanes(self.builder, recipe.arithmetic, 4)  # for single numbers
         self.storage = STORAGE[recipe.storage]
-
-    kept: tuple[str, ...]
 
     def write(self) -> None:
         e, b = self.lanes, self.builder
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         self.grid = Grid.of(j)
-        self.taps = self.of_coefficients(self.recipe.stencil)
+        taps = self.of_coefficients(self.recipe.stencil)
+        self.taps = _Parts(e, self.part, taps)
         steps = Steps(j.steps_low, j.steps_scale, j.steps_last)
         tables = j.opacities, j.colors, j.intervals, j.buckets
-        self.table = TransferTable(e, self.recipe.interval, j.inner, *tables, steps)
-        self.traversal = Traversal(e, j, self.taps, self.kept, self.recipe.skipping)
+        self.table, self.table_of_run = (
+            TransferTable(lanes, self.recipe.interval, j.inner, *tables, steps) for lanes in (e, self.run)
+        )
+        cells = _Parts(self.run, self.part, taps)
+        self.traversal = Traversal(self.run, j, cells, self.kept, self.recipe.skipping)
         self.prepare()
-        with frame.every_chunk(e, j) as chunk:
-            self.traversal.every_block(chunk, self._march_block)
+        with frame.every_chunk(e, j) as chunk, self.traversal.every_block(chunk):
+            self._march_block()
         b.ret_void()
 
-    def of_coefficients(self, stencil: Lowered) -> _Halves:
-        taps = Taps(self.half, stencil, self.storage, self.grid, self.recipe.room)
-        return _Halves(self.lanes, self.half, taps)
+    def of_coefficients(self, stencil: Lowered) -> Taps:
+        return Taps(self.part, stencil, self.storage, self.grid, self.recipe.room)
 
-    def _march_block(self, first: Value, end: Value) -> None:
-        with self.traversal.every_ray(first, end) as (number, state):
+    def _march_block(self) -> None:
+        with self.traversal.every_ray() as (number, state):
             self.begin(number, state)
-        self.traversal.every_pack(first, end, self.march)
-        with self.traversal.every_ray(first, end) as (number, state):
+        self.march_runs()
+        with self.traversal.every_ray() as (number, state):
             self.finish(number, state)
 
     def prepare(self) -> None:
         """Reserve what has to be reserved before any loop."""
 
     def begin(self, number: Value, state: State) -> None:
-        """What is kept of a ray before its first pack."""
+        """What is kept of a ray before its first run."""
         raise NotImplementedError
 
-    def march(self, ray: Ray, first: Value) -> None:
-        """The pack of a ray that begins with segment `first`."""
+    def march_runs(self) -> None:
+        """All runs of a block's rays."""
         raise NotImplementedError
 
     def finish(self, number: Value, state: State) -> None:
         """What is written when a block is done."""
 
-    # --- what is the same for all of a pack ---
+    # --- runs ---
 
     def uniform(self, ray: Ray) -> dict[str, list[Node]]:
-        """The numbers that are the same all along a ray, by name of `ops.derivatives.gradient_columns`."""
+        """The numbers that are the same all along a ray, by name of `ops.derivatives.gradient_columns`; of a run."""
         if not self.recipe.lit:
             return {}
         b, j, columns = self.builder, self.job, gradient_columns(self.recipe.lights)
@@ -236,18 +244,19 @@ class _Program:
         }
 
     def _everywhere(self, array: Value, index: Value) -> Value:
-        e = self.lanes
+        """A number of an array in all lanes of a run."""
+        e = self.run
         return e.everywhere(self.builder.load(e.advance(array, index, e.number), typ=e.number))
 
     def everywhere(self, number: Value) -> Value:
-        """A double in all lanes."""
-        return self.lanes.everywhere(self.lanes.scalar(number))
+        """A double in all lanes of a run."""
+        return self.run.everywhere(self.run.scalar(number))
 
-    def total(self, pack: Value) -> Value:
-        """The sum of all lanes, a double; halves are added first."""
-        return self._widened(self.half.total(self.half.add(*self.lanes.halves(pack))))
+    def total(self, run: Value) -> Value:
+        """The sum of all lanes of a run, a double; halves are added first."""
+        return self.widened(self.part.total(self.part.add(*self.run.parts(run, self.part.count))))
 
-    def _widened(self, number: Value) -> Value:
+    def widened(self, number: Value) -> Value:
         return number if self.lanes.number == DOUBLE else self.builder.fpext(number, DOUBLE)
 
     # --- samples ---
@@ -269,20 +278,17 @@ class _Program:
         vectors = [view[3 * i : 3 * i + 3] for i in range(2 * count)]
         return Lights(shading[0], shading[1], vectors[::2], vectors[1::2], tints[::2], tints[1::2])
 
-    def compose(self, ray: Ray, tau: Value) -> tuple[Value, Value]:
-        """Transmittances T and weights w of segments of optical depths τ, which are added to the depth of the ray."""
-        e, depth = self.lanes, ray.state.kept["depth"]
-        absorbed = e.negate(mathematics.expm1(e, e.negate(tau)))
+    def transmittances(self, absorbed: Value, depth: Value) -> Value:
+        """T of the segments of a run that absorb so much each, behind an optical depth."""
+        e, few = self.run, self.few
         passed = e.delayed(e.running_products(e.subtract(e.constant(1), absorbed)), 1, first=1)
-        transmittance = e.multiply(passed, e.everywhere(self._arriving(depth.value)))
-        faint = self.builder.fcmp_ordered("<", transmittance, self.everywhere(self.job.faint))
-        depth.value = self.builder.fadd(depth.value, self.total(tau))
-        return transmittance, e.where(faint, e.constant(0), e.multiply(transmittance, absorbed))
+        arriving = few.lane(mathematics.exp(few, few.negate(few.everywhere(few.scalar(depth)))), 0)
+        return e.multiply(passed, e.everywhere(arriving))
 
-    def _arriving(self, depth: Value) -> Value:
-        """e^−depth, a number."""
-        few = self.few
-        return few.lane(mathematics.exp(few, few.negate(few.everywhere(few.scalar(depth)))), 0)
+    def weights(self, transmittance: Value, absorbed: Value) -> Value:
+        e = self.run
+        faint = self.builder.fcmp_ordered("<", transmittance, self.everywhere(self.job.faint))
+        return e.where(faint, e.constant(0), e.multiply(transmittance, absorbed))
 
 
 @dataclass(frozen=True)
@@ -308,32 +314,77 @@ class _Sample:
 
 
 class _March(_Program):
+    runs = 2
     kept = ("depth", "red", "green", "blue")
 
     def begin(self, number: Value, state: State) -> None:
         for name in self.kept:
             state.kept[name].value = DOUBLE(0.0)
 
-    def march(self, ray: Ray, first: Value) -> None:
+    def march_runs(self) -> None:
+        self.traversal.every_pair(self._march)
+
+    def _march(self, first: Run, second: Run, same: Value) -> None:
         e, b = self.lanes, self.builder
-        segments = self.traversal.segments(ray, first)
-        rows = [Node(row) for row in self.taps.contract(self.taps.locate(segments.points), self.job.coefficients)]
+        segments = self._segments(first, second)
+        rows = [Node(row) for row in self.taps.contract(segments.points, self.job.coefficients)]
         tape = Tape(e)
         located = self.table.locate(tape, rows[0])
         opacity = self.table.opacity(tape, located)
         tau = optical_depth(tape, opacity, Node(segments.thickness)).value
         tau = e.where(segments.real, tau, e.constant(0))
         with b.if_then(e.any(e.differs(tau))):
-            _, weight = self.compose(ray, tau)
-            seen = e.differs(weight)
-            with b.if_then(e.any(seen)):
-                self._add_light(ray, tape, located, rows, weight, seen)
+            absorbed = self._parts(e.negate(mathematics.expm1(e, e.negate(tau))))
+            weights = self._compose(first, second, same, self._parts(tau), absorbed)
+            with self._every_run(first, second, weights, located, rows[1:]) as (ray, weight, own, gradient):
+                seen = self.run.differs(weight)
+                with b.if_then(self.run.any(seen)):
+                    self._add_light(ray, own, gradient, weight, seen)
 
-    def _add_light(self, ray: Ray, tape: Tape, located: Located, rows: list[Node], weight: Value, seen: Value) -> None:
-        e, b = self.lanes, self.builder
-        color = self.table.color(tape, located, self.table.color_ends(located))
+    @contextmanager
+    def _every_run(
+        self, first: Run, second: Run, weights: list[Value], located: Located, gradient: list[Node]
+    ) -> Iterator[tuple[Ray, Value, Located, list[Node]]]:
+        """For either run: the with-block, given its ray and its part of what was computed for both."""
+        b, e, count = self.builder, self.lanes, self.run.count
+        weight, place = e.kept(self.run.join(weights)), located.kept(e)
+        rows = [e.kept(row.value) for row in gradient]
+        with e.repeat(I64(0), I64(2)) as i:
+            number = b.select(b.icmp_signed("==", i, I64(0)), first.ray.number, second.ray.number)
+            own = [Node(row.part(i, count)) for row in rows]
+            yield self.traversal.ray(number), weight.part(i, count), place(i, count), own
+
+    def _parts(self, pack: Value) -> list[Value]:
+        """The runs of a pack."""
+        return self.lanes.parts(pack, self.run.count)
+
+    def _segments(self, *runs: Run) -> Segments:
+        first, second = (vars(self.traversal.segments(run.ray, run.first)) for run in runs)
+        points = [self.run.join(pair) for pair in zip(first.pop("points"), second.pop("points"), strict=True)]
+        return Segments(points=points, **{name: self.run.join((first[name], second[name])) for name in first})
+
+    def _compose(self, first: Run, second: Run, same: Value, tau: list[Value], absorbed: list[Value]) -> list[Value]:
+        """The weights of two runs; adds their optical depths τ to those of their rays.
+
+        The second begins where the first one of the same ray ends, and has no weight where that ray is opaque.
+        """
+        e, b, depths = self.run, self.builder, [run.ray.state.kept["depth"] for run in (first, second)]
+        before, behind = depths[0].value, b.fadd(depths[0].value, self.total(tau[0]))
+        at_second = b.select(same, behind, depths[1].value)
+        goes_on = b.fcmp_unordered("<=", at_second, self.job.opaque)  # NaN goes on
+        depths[0].value = behind
+        depths[1].value = b.select(goes_on, b.fadd(at_second, self.total(tau[1])), at_second)
+        weights = [
+            self.weights(self.transmittances(own, depth), own)
+            for own, depth in zip(absorbed, (before, at_second), strict=True)
+        ]
+        return [weights[0], e.where(e.everywhere(goes_on), weights[1], e.constant(0))]
+
+    def _add_light(self, ray: Ray, located: Located, gradient: list[Node], weight: Value, seen: Value) -> None:
+        e, b, tape, table = self.run, self.builder, Tape(self.run), self.table_of_run
+        color = table.color(tape, located, table.color_ends(located))
         if self.recipe.lit:
-            color = shade(tape, color, self.world_gradient(tape, rows[1:4]), self.lights(self.uniform(ray)))
+            color = shade(tape, color, self.world_gradient(tape, gradient), self.lights(self.uniform(ray)))
         for name, own in zip(("red", "green", "blue"), color, strict=True):
             light = ray.state.kept[name]
             light.value = b.fadd(light.value, self.total(e.where(seen, e.multiply(weight, own.value), e.constant(0))))
@@ -347,6 +398,7 @@ class _March(_Program):
 
 
 class _Adjoint(_Program):
+    runs = 1
     kept = ("depth", "rest")
 
     def prepare(self) -> None:
@@ -354,10 +406,10 @@ class _Adjoint(_Program):
         number = STORAGE[recipe.arithmetic]
         self.spreading = self.taps
         if number != self.storage:  # derivatives by the coefficients are kept in the arithmetic's type
-            self.spreading = _Halves(e, self.half, Taps(self.half, recipe.stencil, number, self.grid))
+            self.spreading = _Parts(e, self.part, Taps(self.part, recipe.stencil, number, self.grid))
         if recipe.derivatives is not None:
             self.raised = recipe.derivatives[1]
-            self.differentiating = self.of_coefficients(recipe.derivatives[0])
+            self.differentiating = _Parts(e, self.part, self.of_coefficients(recipe.derivatives[0]))
         self.columns = gradient_columns(recipe.lights if recipe.lit else None)
 
     def wants(self, name: str) -> bool:
@@ -367,10 +419,12 @@ class _Adjoint(_Program):
         state.kept["depth"].value = DOUBLE(0.0)
         state.kept["rest"].value = self._behind_everything(number)
 
-    def march(self, ray: Ray, first: Value) -> None:
-        segments = self.traversal.segments(ray, first)
-        located_taps = self.taps.locate(segments.points)
-        rows = [Node(row) for row in self.taps.contract(located_taps, self.job.coefficients)]
+    def march_runs(self) -> None:
+        self.traversal.every_run(self._march)
+
+    def _march(self, run: Run) -> None:
+        ray, segments = run.ray, self.traversal.segments(run.ray, run.first)
+        rows = [Node(row) for row in self.taps.contract(segments.points, self.job.coefficients)]
         tape = Tape(self.lanes)
         located = self.table.locate(tape, rows[0])
         with self._if_it_counts(located, segments):
@@ -382,7 +436,7 @@ class _Adjoint(_Program):
                 self._add_to_table(sample)
             adjoints = [self._of_real(row.adjoint, segments) for row in rows]
             if self.wants("coefficients"):
-                self._spread(adjoints, segments, located_taps)
+                self.spreading.spread(segments.points, self.job.coefficient_gradient, adjoints)
             if self.wants("rays"):
                 self._add_to_rays(sample, adjoints, ray)
 
@@ -424,10 +478,14 @@ class _Adjoint(_Program):
         return _Sample(segments, located, thickness, tau, ends, color, uniform)
 
     def _compose_back(self, sample: _Sample, ray: Ray) -> None:
-        """Adjoints of τ and of the colour; depth and rest of the light behind the pack."""
+        """Adjoints of τ and of the colour; depth and rest of the light behind the run."""
         e, b, j, real = self.lanes, self.builder, self.job, sample.segments.real
-        rest, traversal = ray.state.kept["rest"], self.traversal
-        transmittance, weight = self.compose(ray, e.where(real, sample.tau.value, e.constant(0)))
+        depth, rest, traversal = ray.state.kept["depth"], ray.state.kept["rest"], self.traversal
+        tau = e.where(real, sample.tau.value, e.constant(0))
+        absorbed = e.negate(mathematics.expm1(e, e.negate(tau)))
+        transmittance = self.transmittances(absorbed, depth.value)
+        weight = self.weights(transmittance, absorbed)
+        depth.value = b.fadd(depth.value, self.total(tau))
         g = [self.everywhere(own) for own in traversal.triple(j.light_cotangent, ray.number)]
         shown = None
         for own, color in zip(g, sample.color, strict=True):
@@ -440,7 +498,7 @@ class _Adjoint(_Program):
         sample.tau.adjoint = e.where(real, adjoint, e.constant(0))
         for own, color in zip(g, sample.color, strict=True):
             color.adjoint = e.multiply(weight, own)
-        rest.value = b.fsub(rest.value, self._widened(e.lane(passed, e.count - 1)))
+        rest.value = b.fsub(rest.value, self.widened(e.lane(passed, e.count - 1)))
 
     # --- backwards ---
 
@@ -453,7 +511,7 @@ class _Adjoint(_Program):
                         self._add(ray, name, index, self._of_real(node.adjoint, sample.segments))
 
     def _add(self, ray: Ray, name: str, index: int, more: Value) -> None:
-        """Add the sum of a pack to one of a ray's derivatives."""
+        """Add the sum of a run to one of a ray's derivatives."""
         b, width = self.builder, max(columns.stop for columns in self.columns.values())
         column = b.add(b.mul(ray.number, I64(width)), I64(self.columns[name].start + index))
         place = self.lanes.advance(self.job.ray_gradient, column, DOUBLE)
@@ -466,16 +524,10 @@ class _Adjoint(_Program):
             own = packs[first : first + 4]
             self.table.add_to_rows(self.job.table_gradient, sample.located.interval, own, TABLE_ROW, first)
 
-    def _spread(self, adjoints: list[Value], segments: Segments, located: _LocatedTaps) -> None:
-        if self.spreading is not self.taps:
-            located = self.spreading.locate(segments.points)
-        self.spreading.spread(located, self.job.coefficient_gradient, adjoints)
-
     def _add_to_rays(self, sample: _Sample, adjoints: list[Value], ray: Ray) -> None:
         """Derivatives by entry, direction and length: points are entry + t direction, and the last t ends there."""
         e, segments = self.lanes, sample.segments
-        located = self.differentiating.locate(segments.points)
-        derivatives = self.differentiating.contract(located, self.job.coefficients)
+        derivatives = self.differentiating.contract(segments.points, self.job.coefficients)
         to_length = None
         for axis in range(3):
             total = None

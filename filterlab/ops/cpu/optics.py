@@ -33,7 +33,7 @@ D and S are the lights' colours times the weights of diffuse and specular reflec
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from llvmlite import ir
@@ -64,6 +64,16 @@ class Located:
     ends: list[Node]
     fraction: Node
     blue: list[Value] | None = None
+
+    def kept(self, lanes: Lanes) -> Callable[[Value, int], Located]:
+        """Write it to memory; the result reads part number i of `count` lanes each. No derivatives are passed on."""
+        packs = [lanes.kept(p) for p in (self.interval, self.fraction.value, *(self.blue or []))]
+
+        def part(i: Value, count: int) -> Located:
+            interval, fraction, *blue = (pack.part(i, count) for pack in packs)
+            return Located(interval, [], Node(fraction), blue or None)
+
+        return part
 
     def colored(self, lanes: Lanes) -> Value:
         """A mask: the interval has an opacity other than 0 at one of its ends."""

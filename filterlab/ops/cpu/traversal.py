@@ -1,8 +1,12 @@
 """The way through the rays: which segments are marched next, and which are left out as nothing is to be seen there.
 
-A pack (`ops.cpu.lanes`) is P consecutive segments of one ray: they enter and leave the volume together, read
-neighbouring coefficients, and no lane waits for another. Rays are taken in blocks, and of all rays of a block one pack
-in turn: neighbours find in the cache what the others have read.
+A *run* is a number of consecutive segments of one ray: they enter and leave the volume together, read neighbouring
+coefficients, and none waits for another. Rays are taken in blocks, and of all rays of a block one run in turn:
+neighbours find in the cache what the others have read.
+
+Most of a march is chains of operations that wait for one another, so that two runs are marched at a time: one waits
+for the next one, of whatever ray, and both make a pack (`ops.cpu.lanes`). Runs are composed one after the other, and it
+changes no bit of a ray which runs its own were marched with.
 
 Empty space is left out before anything is computed (`render.bricks` explains the bricks): if the nearest brick that is
 not empty is d bricks away, nothing comes within d − 1 bricks.
@@ -39,7 +43,7 @@ class State:
 
 @dataclass(frozen=True)
 class Ray:
-    """What is the same for all packs of a ray.
+    """What is the same for all runs of a ray.
 
     Attributes:
         number: of the ray.
@@ -59,8 +63,16 @@ class Ray:
 
 
 @dataclass(frozen=True)
+class Run:
+    """Segments of a ray from number `first` on."""
+
+    ray: Ray
+    first: Value
+
+
+@dataclass(frozen=True)
 class Segments:
-    """A pack of consecutive segments of a ray.
+    """Packs of segments.
 
     Attributes:
         real: a mask of those that the ray has.
@@ -88,13 +100,13 @@ class Footprint(Protocol):
 
 
 class Traversal:
-    """Writes the loops over rays and their packs. Make it before any loop: it reserves memory.
+    """Writes the loops over rays and their runs. Make it before any loop: it reserves memory.
 
     Args:
-        lanes: of a pack.
+        lanes: of a run.
         job: fields of `ops.cpu.march.FIELDS`.
-        taps: they know where the taps of points are, of packs or parts of them.
-        kept: names of the doubles that are kept of every ray from pack to pack; "depth" is one of them.
+        taps: they know where the taps of a run's points are.
+        kept: names of the doubles that are kept of every ray from run to run; "depth" is one of them.
         skipping: whether empty bricks are left out.
     """
 
@@ -108,65 +120,101 @@ class Traversal:
 
     # --- blocks and turns ---
 
-    def every_block(self, chunk: Value, march: Callable[[Value, Value], None]) -> None:
-        """for the blocks chunk, chunk + stride, …: what `march` writes, given the block's first ray and its end."""
+    @contextmanager
+    def every_block(self, chunk: Value) -> Iterator[None]:
+        """for the blocks chunk, chunk + stride, …: the with-block; what follows is about the rays of that block."""
         e, b, j = self.lanes, self.builder, self.job
         size = I64(RAYS_OF_A_BLOCK)
         blocks = b.udiv(b.add(b.sub(j.last, j.first), I64(RAYS_OF_A_BLOCK - 1)), size)
         turns = b.udiv(b.add(b.sub(blocks, chunk), b.sub(j.stride, I64(1))), j.stride)
         with e.repeat(I64(0), turns) as turn:
             first = b.add(j.first, b.mul(b.add(chunk, b.mul(turn, j.stride)), size))
-            march(first, e.smaller(b.add(first, size), j.last))
+            self._first, self._end = first, e.smaller(b.add(first, size), j.last)
+            yield
 
     @contextmanager
-    def every_ray(self, first: Value, end: Value) -> Iterator[tuple[Value, State]]:
-        """for every ray of a block: the with-block, given its number and state."""
-        with self.lanes.repeat(first, end) as number:
-            yield number, self._state(first, number)
+    def every_ray(self) -> Iterator[tuple[Value, State]]:
+        """for every ray of the block: the with-block, given its number and state."""
+        with self.lanes.repeat(self._first, self._end) as number:
+            yield number, self._state(number)
 
-    def every_pack(self, first: Value, end: Value, march: Callable[[Ray, Value], None]) -> None:
-        """while a ray of the block has segments left: what `march` writes, given a ray and the first one of a pack."""
+    def every_run(self, march: Callable[[Run], None]) -> None:
+        """while a ray of the block has segments left: what `march` writes, given a run."""
+        with self._every_turn(self._end) as (turn, going):
+            found = self._next_run(self.ray(turn), going)
+            with self._if_number(found):
+                march(Run(self.ray(turn), found.value))
+
+    def every_pair(self, march: Callable[[Run, Run, Value], None]) -> None:
+        """The same with two runs at a time, and whether they are of the same ray.
+
+        After the last ray it is nobody's turn. If there was no run in all of a turn, the one that still waits is
+        marched with one beyond the end of its own ray.
+        """
         e, b = self.lanes, self.builder
-        with self.every_ray(first, end) as (_, state):
+        waiting, since = e.variable(I64(-1)), e.variable(I64(0))
+        with self._every_turn(b.add(self._end, I64(1))) as (turn, going):
+            number, found = e.variable(turn), e.variable(I64(-1))
+            with b.if_else(b.icmp_signed("<", turn, self._end)) as (somebody, nobody):
+                with somebody:
+                    found.value = self._next_run(self.ray(turn), going).value
+                with nobody, b.if_then(b.icmp_signed("==", going.value, I64(0))), self._if_number(waiting):
+                    number.value = waiting.value
+                    found.value = self.ray(waiting.value).count
+            with self._if_number(found), b.if_else(b.icmp_signed("<", waiting.value, I64(0))) as (alone, together):
+                with alone:
+                    waiting.value, since.value = number.value, found.value
+                with together:
+                    other = Run(self.ray(waiting.value), since.value)
+                    run = Run(self.ray(number.value), found.value)
+                    march(other, run, b.icmp_signed("==", waiting.value, number.value))
+                    waiting.value = I64(-1)
+
+    @contextmanager
+    def _every_turn(self, stop: Value) -> Iterator[tuple[Value, Variable]]:
+        """again and again for every number from the first ray's to before `stop`, until nobody sets `going` to 1."""
+        e, b = self.lanes, self.builder
+        with self.every_ray() as (_, state):
             state.next.value = I64(0)
         going = e.variable(I64(1))
         with e.repeat_while(lambda: b.icmp_signed("!=", going.value, I64(0))):
             going.value = I64(0)
-            with e.repeat(first, end) as number:
-                ray = self._ray(first, number)
-                with b.if_then(self._goes_on(ray)):
-                    going.value = I64(1)
-                    self._next_pack(ray, march)
+            with e.repeat(self._first, stop) as turn:
+                yield turn, going
 
-    def _goes_on(self, ray: Ray) -> Value:
-        """Whether a ray has segments left and is not opaque yet."""
-        b = self.builder
-        transparent = b.fcmp_unordered("<=", ray.state.kept["depth"].value, self.job.opaque)  # NaN goes on
-        return b.and_(b.icmp_signed("<", ray.state.next.value, ray.count), transparent)
+    @contextmanager
+    def _if_number(self, found: Variable) -> Iterator[None]:
+        """if found ≥ 0: the with-block."""
+        with self.builder.if_then(self.builder.icmp_signed(">=", found.value, I64(0))):
+            yield
 
-    def _next_pack(self, ray: Ray, march: Callable[[Ray, Value], None]) -> None:
-        b, following = self.builder, ray.state.next
-        first = following.value
-        if self.skipping:
-            with self._unless_empty(ray):
-                march(ray, first)
-        else:
-            march(ray, first)
-        following.value = b.add(following.value, I64(self.lanes.count))
+    def _next_run(self, ray: Ray, going: Variable) -> Variable:
+        """The first segment of a ray's next run, or −1: it has ended, or leapt. `going`: it has not ended."""
+        b, state, found = self.builder, ray.state, self.lanes.variable(I64(-1))
+        transparent = b.fcmp_unordered("<=", state.kept["depth"].value, self.job.opaque)  # NaN goes on
+        with b.if_then(b.and_(b.icmp_signed("<", state.next.value, ray.count), transparent)):
+            going.value = I64(1)
+            if self.skipping:
+                with self._unless_empty(ray):
+                    found.value = state.next.value
+            else:
+                found.value = state.next.value
+            state.next.value = b.add(state.next.value, I64(self.lanes.count))
+        return found
 
     # --- rays ---
 
-    def _state(self, first: Value, number: Value) -> State:
-        e, place = self.lanes, self.builder.sub(number, first)
+    def _state(self, number: Value) -> State:
+        e, place = self.lanes, self.builder.sub(number, self._first)
         kept = {name: e.at(e.advance(array, place, DOUBLE), DOUBLE) for name, array in self._kept.items()}
         return State(e.at(e.advance(self._next, place, I64), I64), kept)
 
-    def _ray(self, first: Value, number: Value) -> Ray:
+    def ray(self, number: Value) -> Ray:
         b, j = self.builder, self.job
         entry, direction = self.triple(j.entry, number), self.triple(j.direction, number)
         length, offset = self.double(j.length, number), self.double(j.offset, number)
         count = b.load(self.lanes.advance(j.count, number, I64), typ=I64)
-        return Ray(number, entry, direction, length, offset, count, self._state(first, number))
+        return Ray(number, entry, direction, length, offset, count, self._state(number))
 
     def triple(self, array: Value, number: Value) -> list[Value]:
         """Three doubles of a ray."""
@@ -181,7 +229,7 @@ class Traversal:
     def segments(self, ray: Ray, first: Value) -> Segments:
         """Those from number `first` on, as `render.rays.segments` cuts them.
 
-        Only the place of the pack is computed in doubles. Lane i is i steps further; the first and the last segment of
+        Only the place of the run is computed in doubles. Lane i is i steps further; the first and the last segment of
         a ray are shorter by what is cut off them at their start and end, and their middle moves by half of that.
         """
         e, b = self.lanes, self.builder
@@ -223,10 +271,10 @@ class Traversal:
 
     @contextmanager
     def _unless_empty(self, ray: Ray) -> Iterator[None]:
-        """The with-block, unless all of the next pack lies in empty bricks; the ray leaps over those that do as well.
+        """The with-block, unless all of the next run lies in empty bricks; the ray leaps over those that do as well.
 
         From a point in a brick at distance d, steps of together less than d − 1 bricks along every axis stay within
-        bricks at a distance of at least 1. From the middle of a pack half as many steps as it has segments lead to its
+        bricks at a distance of at least 1. From the middle of a run half as many steps as it has segments lead to its
         first one, and one less to its last. Where that is too far every lane looks for itself.
         """
         b, e, following = self.builder, self.lanes, ray.state.next
@@ -241,12 +289,12 @@ class Traversal:
         cells = b.shl(b.sub(distance, I64(1)), self.job.edge)
         reach = b.fsub(b.sitofp(cells, DOUBLE), self.job.slack)
         steps = self._smaller(b.fmul(reach, self._segments_per_voxel(ray.direction)), DOUBLE(2.0**40))
-        packs = b.ashr(b.add(b.fptosi(steps, I64), half), I64(e.count.bit_length() - 1))
-        leaps = b.and_(b.icmp_signed(">", packs, I64(0)), b.fcmp_ordered(">=", reach, DOUBLE(0.0)))
+        runs = b.ashr(b.add(b.fptosi(steps, I64), half), I64(e.count.bit_length() - 1))
+        leaps = b.and_(b.icmp_signed(">", runs, I64(0)), b.fcmp_ordered(">=", reach, DOUBLE(0.0)))
         b.cbranch(leaps, far, look)
 
         b.position_at_end(far)
-        following.value = b.add(following.value, b.mul(b.sub(packs, I64(1)), I64(e.count)))
+        following.value = b.add(following.value, b.mul(b.sub(runs, I64(1)), I64(e.count)))
         b.branch(done)
 
         b.position_at_end(look)
