@@ -53,19 +53,20 @@ class Scene:
 
     @property
     def transfer(self) -> TransferFunction:
-        positions = torch.linspace(0, 1, len(self.table), dtype=torch.float64)
-        return TransferFunction(positions, self.table[:, :3].double(), self.table[:, 3].double())
+        return _transfer(self.table)
 
     @property
     def shading(self) -> Shading | None:
         return LIGHTING if self.lit else None
 
-    def field(self, method: str, scheme: str) -> Field:
-        return reconstruct(self.volume, method, boundary="reflect", scheme=scheme)
+    def field(self, method: str, scheme: str, volume: Tensor | None = None) -> Field:
+        """Of the volume, or of another one of its size."""
+        return reconstruct(self.volume if volume is None else volume, method, boundary="reflect", scheme=scheme)
 
-    def image(self, field: Field, **options: Any) -> Tensor:
+    def image(self, field: Field, table: Tensor | None = None, **options: Any) -> Tensor:
         """(size, size, 4) by filterlab's renderer; the field's scheme decides which marcher works."""
-        return render(field, self.camera, self.transfer, **self._options, **options)
+        transfer = self.transfer if table is None else _transfer(table)
+        return render(field, self.camera, transfer, **self._options, **options)
 
     def samples(self, field: Field, **options: Any) -> int:
         """Of all rays together, as the renderer counts them before it leaves any out."""
@@ -74,6 +75,11 @@ class Scene:
     @property
     def _options(self) -> dict[str, Any]:
         return {"size": (self.size, self.size), "step": self.step, "shading": self.shading}
+
+
+def _transfer(table: Tensor) -> TransferFunction:
+    positions = torch.linspace(0, 1, len(table), dtype=torch.float64)
+    return TransferFunction(positions, table[:, :3].double(), table[:, 3].double())
 
 
 def marschner_lobb(n: int, size: int, **options: Any) -> Scene:

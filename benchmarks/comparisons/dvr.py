@@ -105,8 +105,7 @@ def _backward(settings: Settings) -> Race:
     table = scene.table.clone().requires_grad_()
 
     def both() -> tuple[Tensor, ...]:
-        moving = replace(scene, volume=volume, table=table)
-        image = moving.image(moving.field("triquadratic", "fused"))
+        image = scene.image(scene.field("triquadratic", "fused", volume), table)
         torch.autograd.grad(image.mean(), (volume, table))
         return (image.detach(),)
 

@@ -238,11 +238,13 @@ class March:
             from filterlab.ops.cuda import adjoint
 
             return adjoint.run(self, gradients, arrays, report)
+        from filterlab.ops.cpu.march import TABLES
+
         lights = self.lighting.lights if self.lighting else None
         rays, intervals = self.rays.count.shape[0], max(len(self.transfer.positions) - 1, 1)
         threads = self._threads_of_adjoint("coefficients" in gradients)
         by_ray = torch.zeros(rays, columns_of_rays(lights), dtype=torch.float64)
-        tables = torch.zeros(threads, intervals, TABLE_ROW, dtype=torch.float64)
+        tables = torch.zeros(threads, TABLES, intervals, TABLE_ROW, dtype=torch.float64)
         volumes = []
         if "coefficients" in gradients:
             volumes = [cpu._zeros((1, *self.coefficients.shape), self.dtype)[0] for _ in range(threads)]
@@ -256,7 +258,7 @@ class March:
         for part in volumes[1:]:
             volumes[0] += part
         volume = volumes[0] if volumes else None
-        return by_name(gradients, volume, by_ray, tables.sum(0), len(self.transfer.positions), lights)
+        return by_name(gradients, volume, by_ray, tables.sum((0, 1)), len(self.transfer.positions), lights)
 
     def _threads_of_adjoint(self, with_volumes: bool) -> int:
         """One for every so many rays, and no more volumes of derivatives than memory allows."""

@@ -28,7 +28,8 @@ from filterlab.ops.march import Bricks
 from filterlab.ops.stencil import Lowered, Stencil, Table
 from filterlab.render.transfer import TransferFunction
 
-EDGE = 3  # log₂ B
+_EDGES = (2, 3)  # log₂ B: bricks of 4³ cells, and of 8³ where there would be more of those than
+_MOST_FINE = 1 << 17
 _FARTHEST = 15  # bricks; a leap of as many costs next to nothing
 _ROUNDING = 64  # units of rounding that a sum of taps may lose, relative to Σ |w| · max |c|
 _PARTS = 64  # of a cell, along an axis, in which a weight is bounded
@@ -37,17 +38,23 @@ _NOTHING = 1e-12  # rounding of a coefficient that is 0
 _LARGEST = 1 << 24  # numbers that bounding such a sum may take
 
 
-def bricks_of(coefficients: Tensor, stencil: Stencil, transfer: TransferFunction, edge: int = EDGE) -> Bricks | None:
+def bricks_of(
+    coefficients: Tensor, stencil: Stencil, transfer: TransferFunction, edge: int | None = None
+) -> Bricks | None:
     """Where a volume is empty; None: nowhere.
 
     Args:
         coefficients: (D, H, W).
         stencil: its first row is the value.
         transfer: with tables in the dtype of the samples.
-        edge: log₂ B.
+        edge: log₂ B; None: as small as pays. Measured on a sparse 128³: 4³ leave out 78 % of the runs, 8³ 72 %, but
+            take 2.2 ms to find instead of 0.4.
     """
     if not transfer.transparent_somewhere:
         return None
+    if edge is None:
+        fine, coarse = _EDGES
+        edge = fine if coefficients.numel() >> 3 * fine <= _MOST_FINE else coarse
     low, high = ranges(coefficients, stencil.supports, edge)
     empty = transparent(*values(low, high, stencil.lowered, transfer.positions.dtype), transfer)
     return Bricks(distances(empty), edge) if bool(empty.any()) else None

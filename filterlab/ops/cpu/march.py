@@ -39,6 +39,8 @@ from filterlab.ops.cpu.traversal import Ray, Run, Segments, State, Traversal
 from filterlab.ops.derivatives import TABLE_ROW, gradient_columns
 from filterlab.ops.stencil import Lowered
 
+TABLES = 2  # of derivatives by the transfer function, to be summed
+
 # Arrays are contiguous. R rays, K lights; "number" is the type of the arithmetic, d a double.
 FIELDS: dict[str, type] = {
     "next": ctypes.c_int64,  # the chunk to be taken next; threads add 1 atomically
@@ -77,7 +79,7 @@ FIELDS: dict[str, type] = {
     "light_cotangent": ctypes.c_void_p,  # (R, 3) d
     "depth_cotangent": ctypes.c_void_p,  # (R) d
     "ray_gradient": ctypes.c_void_p,  # (R, 7) d, lit (R, 9 + 12 K), see `ops.derivatives`; added to
-    "table_gradient": ctypes.c_void_p,  # (intervals, 12) d, see there; added to
+    "table_gradient": ctypes.c_void_p,  # (TABLES, intervals, 12) d, see there; added to
     "coefficient_gradient": ctypes.c_void_p,  # (D, H, W) numbers; added to
     "first": ctypes.c_int64,  # rays to be marched: from this one
     "last": ctypes.c_int64,  # to before this one
@@ -520,9 +522,13 @@ class _Adjoint(_Program):
     def _add_to_table(self, sample: _Sample) -> None:
         """Derivatives by the ends of the intervals: 12 numbers of every lane's row."""
         packs = [self._of_real(node.adjoint, sample.segments) for node in (*sample.located.ends, *sample.ends)]
+        size = self.builder.mul(self.job.intervals, I64(TABLE_ROW))
+        tables = [
+            self.lanes.advance(self.job.table_gradient, self.builder.mul(size, I64(i)), DOUBLE) for i in range(TABLES)
+        ]
         for first in (0, 4, 8):
             own = packs[first : first + 4]
-            self.table.add_to_rows(self.job.table_gradient, sample.located.interval, own, TABLE_ROW, first)
+            self.table.add_to_rows(tables, sample.located.interval, own, TABLE_ROW, first)
 
     def _add_to_rays(self, sample: _Sample, adjoints: list[Value], ray: Ray) -> None:
         """Derivatives by entry, direction and length: points are entry + t direction, and the last t ends there."""

@@ -191,8 +191,13 @@ class TransferTable:
             quads.append(e.load(e.advance(table, place, e.number), e.number, 4))
         return _transpose_quads(e, [e.join(_lanes_of_groups(quads, (k,))) for k in range(4)])
 
-    def add_to_rows(self, table: Value, interval: Value, packs: Sequence[Value], width: int, first: int) -> None:
-        """Add up to four packs to every lane's row of a table of doubles, one lane after the other."""
+    def add_to_rows(
+        self, tables: Sequence[Value], interval: Value, packs: Sequence[Value], width: int, first: int
+    ) -> None:
+        """Add up to four packs to every lane's row of a table of doubles, one lane after the other.
+
+        Lanes take turns with the tables, whose sum counts: neighbours often share a row, and would wait for each other.
+        """
         e, b = self.lanes, self.lanes.builder
         padded = [*packs, *[e.constant(0)] * (4 - len(packs))]
         groups = _transpose_quads(e, padded)
@@ -202,7 +207,7 @@ class TransferTable:
             quad = e.shuffle(own, own, range(lane // 4 * 4, lane // 4 * 4 + 4))
             quad = quad if e.number == DOUBLE else b.fpext(quad, wide)
             row = b.mul(b.zext(e.lane(interval, lane), I64), I64(width))
-            place = e.advance(table, b.add(row, I64(first)), DOUBLE)
+            place = e.advance(tables[lane % len(tables)], b.add(row, I64(first)), DOUBLE)
             e.store(b.fadd(e.load(place, DOUBLE, 4), quad), place)
 
 
