@@ -220,18 +220,46 @@ def _compute(samples: Tensor, dims: tuple[int, ...], prefilter: Prefilter, bound
 def _adjoint(
     cotangents: Tensor, shape: torch.Size, dims: tuple[int, ...], prefilter: Prefilter, boundary: Boundary, tail: int
 ) -> Tensor:
-    """Back to the shape of the samples. Memory: the cotangents with `prefilter.decay` voxels more on every side."""
+    """Back to the shape of the samples.
+
+    A periodic boundary goes on in the coefficients as it does in the samples: what was given beyond the ends is folded
+    back, and as the filter is symmetric, so is its inverse. Under mirror it is with respect to a product in which the
+    two samples on the mirrors count half, for they have no image.
+
+    Memory: under border the cotangents with `prefilter.decay` voxels more on every side.
+    """
     if boundary is Boundary.ZEROS:
         return _fused(cotangents, dims, prefilter, boundary, -tail)
+    if boundary.periodic:
+        out = cotangents.clone()
+        for dim in dims if tail else ():
+            out = _fold(out, dim, boundary, shape[dim], tail)
+        if boundary is not Boundary.MIRROR:
+            return _fused(out, dims, prefilter, boundary, 0)
+        return _at_mirrors(_own(_fused(_at_mirrors(out, dims, 2.0), dims, prefilter, boundary, 0)), dims, 0.5)
     beyond = prefilter.decay(cotangents.dtype)
-    out = _fused(cotangents, dims, prefilter, Boundary.ZEROS, beyond)
+    out = _own(_fused(cotangents, dims, prefilter, Boundary.ZEROS, beyond))
     for dim in dims:
         out = _fold(out, dim, boundary, shape[dim], tail + beyond)
     return out
 
 
+def _own(x: Tensor) -> Tensor:
+    """What `_fused` gave, to be written to: torch forbids that where it records derivatives."""
+    return x if plain(x) else x.clone()
+
+
+def _at_mirrors(x: Tensor, dims: tuple[int, ...], factor: float) -> Tensor:
+    """Multiply x by a factor at the first and the last place of every axis that has more than one."""
+    for dim in dims:
+        if (n := x.shape[dim]) > 1:
+            for end in (0, n - 1):
+                x.narrow(dim, end, 1).mul_(factor)
+    return x
+
+
 def _fold(x: Tensor, dim: int, boundary: Boundary, n: int, beyond: int) -> Tensor:
-    """The adjoint of `boundary.extend(·, dim, beyond, beyond)` of n samples."""
+    """The adjoint of `boundary.extend(·, dim, beyond, beyond)` of n samples: x, added to, but for what is beyond."""
     outside = torch.cat((torch.arange(-beyond, 0, device=x.device), torch.arange(n, n + beyond, device=x.device)))
     ends = torch.cat((x.narrow(dim, 0, beyond), x.narrow(dim, beyond + n, beyond)), dim)
-    return x.narrow(dim, beyond, n).index_add(dim, boundary.source(outside, n), ends)
+    return x.narrow(dim, beyond, n).index_add_(dim, boundary.source(outside, n), ends)
