@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -55,30 +56,54 @@ def bricks_of(
     if edge is None:
         fine, coarse = _EDGES
         edge = fine if coefficients.numel() >> 3 * fine <= _MOST_FINE else coarse
-    low, high = ranges(coefficients, stencil.supports, edge)
-    empty = transparent(*values(low, high, stencil.lowered, transfer.positions.dtype), transfer)
-    return Bricks(distances(empty), edge) if bool(empty.any()) else None
+    volume = _volume(coefficients, stencil.supports, edge)
+    asked = stencil.lowered, _what_is_clear(transfer)
+    if volume.asked != asked:
+        empty = transparent(*values(*volume.ranges, stencil.lowered, transfer.positions.dtype), transfer)
+        volume.bricks = Bricks(distances(empty), edge) if bool(empty.any()) else None
+        volume.asked = asked
+    return volume.bricks
+
+
+def _what_is_clear(transfer: TransferFunction) -> tuple[object, ...]:
+    """All that `transparent` depends on, to be compared."""
+    x, clear = transfer.positions.detach(), transfer.opacities.detach() == 0
+    return x.dtype, x.device, tuple(x.tolist()), tuple(clear.tolist())
 
 
 # --- ranges of coefficients -----------------------------------------------------------------------------------------
 
-_known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
-"""Ranges of tensors that are still alive: {(layout, what was asked): (version of the tensor, ranges)}."""
 
+@dataclass
+class _Volume:
+    """What is known of a volume.
 
-def ranges(coefficients: Tensor, supports: tuple[int, int, int], edge: int) -> tuple[Tensor, Tensor]:
-    """Smallest and largest coefficient that every brick's cells read: (bz, by, bx) float64 each; NaN where one is.
-
-    Kept for as long as the coefficients are, and made anew after they were written to.
+    Attributes:
+        ranges: smallest and largest coefficient that every brick's cells read: (bz, by, bx) float64 each; NaN where
+            one is.
+        asked: of whom `bricks` are: camera and lights change more often than what is transparent.
+        bricks: see `bricks_of`.
     """
+
+    ranges: tuple[Tensor, Tensor]
+    asked: object = None
+    bricks: Bricks | None = None
+
+
+_known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+"""Of tensors that are still alive: {(layout, supports, edge): (version of the tensor, what is known)}."""
+
+
+def _volume(coefficients: Tensor, supports: tuple[int, int, int], edge: int) -> _Volume:
+    """Kept for as long as the coefficients are, and made anew after they were written to."""
     owner, grid = coefficients if coefficients._base is None else coefficients._base, coefficients.detach()
     if grid.is_inference():  # these don't count how often they are written to
-        return _ranges(grid, supports, edge)
+        return _Volume(_ranges(grid, supports, edge))
     asked = grid.storage_offset(), grid.shape, grid.stride(), supports, edge
     kept: dict = _known.setdefault(owner, {})  # type: ignore[assignment]
     version, found = kept.get(asked, (None, None))
     if found is None or version != grid._version:
-        found = _ranges(grid, supports, edge)
+        found = _Volume(_ranges(grid, supports, edge))
         kept[asked] = grid._version, found
     return found
 

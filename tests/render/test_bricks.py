@@ -77,7 +77,7 @@ def test_bounds_that_are_known() -> None:
 @pytest.mark.parametrize("edge", [0, 2, 3])
 def test_ranges_against_a_loop(edge: int) -> None:
     grid = torch.randn(9, 14, 6)
-    low, high = bricks.ranges(grid, (3, 2, 4), edge)
+    low, high = bricks._volume(grid, (3, 2, 4), edge).ranges
     size = 1 << edge
     for z, y, x in itertools.product(*map(range, low.shape)):
         own = grid[z * size : (z + 1) * size + 3, y * size : (y + 1) * size + 1, x * size : (x + 1) * size + 2]
@@ -88,28 +88,45 @@ def test_ranges_against_a_loop(edge: int) -> None:
 
 def test_ranges_are_kept_until_the_volume_changes_or_goes() -> None:
     grid = torch.randn(9, 9, 9)
-    first = bricks.ranges(grid, (2, 2, 2), 2)
-    assert bricks.ranges(grid, (2, 2, 2), 2) is first
-    assert bricks.ranges(grid, (3, 3, 3), 2) is not first
+    first = bricks._volume(grid, (2, 2, 2), 2).ranges
+    assert bricks._volume(grid, (2, 2, 2), 2).ranges is first
+    assert bricks._volume(grid, (3, 3, 3), 2).ranges is not first
     grid[4, 4, 4] = 50.0
-    assert float(bricks.ranges(grid, (2, 2, 2), 2)[1].max()) == 50
+    assert float(bricks._volume(grid, (2, 2, 2), 2).ranges[1].max()) == 50
     batch = torch.randn(2, 9, 9, 9)
-    assert float(bricks.ranges(batch[0], (2, 2, 2), 2)[1].max()) == batch[0].max()
-    assert float(bricks.ranges(batch[1], (2, 2, 2), 2)[1].max()) == batch[1].max()
+    assert float(bricks._volume(batch[0], (2, 2, 2), 2).ranges[1].max()) == batch[0].max()
+    assert float(bricks._volume(batch[1], (2, 2, 2), 2).ranges[1].max()) == batch[1].max()
     known = len(bricks._known)
     del grid, batch
     gc.collect()
     assert len(bricks._known) == known - 2
 
 
+def test_bricks_are_kept_until_volume_or_opacities_change() -> None:
+    grid, stencil = ball(), ops.Stencil.jet((bspline(2),) * 3, 0)
+
+    def peak(low: float, high: float, color: float = 0.2) -> TransferFunction:
+        return TransferFunction.triangle_peaks([(low + 0.05, 0.05, high, (color, 0.4, 1.0))])
+
+    found = bricks.bricks_of(grid, stencil, peak(0.5, 0.6))
+    assert bricks.bricks_of(grid, stencil, peak(0.5, 0.3, color=0.9)) is found  # where it is clear is all that counts
+    elsewhere = bricks.bricks_of(grid, stencil, peak(0.2, 0.6))
+    assert found is not None
+    assert elsewhere is not None
+    assert not torch.equal(elsewhere.distance, found.distance)
+    assert torch.equal(bricks.bricks_of(grid, stencil, peak(0.5, 0.6)).distance, found.distance)
+    grid.fill_(0.55)
+    assert bricks.bricks_of(grid, stencil, peak(0.5, 0.6)) is None
+
+
 def test_ranges_of_integers_halves_and_nan() -> None:
     grid = torch.randn(8, 8, 8) * 50
     for stored in (torch.uint8, torch.int16, torch.float16, torch.bfloat16):
-        low, high = bricks.ranges(grid.abs().to(stored), (2, 2, 2), 2)
+        low, high = bricks._volume(grid.abs().to(stored), (2, 2, 2), 2).ranges
         assert float(low.min()) == float(grid.abs().to(stored).double().min())
         assert float(high.max()) == float(grid.abs().to(stored).double().max())
     grid[3, 3, 3] = torch.nan
-    low, high = bricks.ranges(grid, (2, 2, 2), 2)
+    low, high = bricks._volume(grid, (2, 2, 2), 2).ranges
     assert low.isnan().sum() == high.isnan().sum() == 1
 
 
