@@ -97,6 +97,11 @@ class Kept:
     def all(self, count: int) -> Value:
         return self.part(I64(0), count)
 
+    def number(self, index: Value) -> Value:
+        """What one lane has."""
+        b = self._builder
+        return b.load(b.gep(self._place, [index], source_etype=self._element), typ=self._element)
+
 
 class Lanes:
     """Writes instructions at the end of the current block.

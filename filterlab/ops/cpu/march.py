@@ -31,10 +31,10 @@ from llvmlite import ir
 
 from filterlab.ops.cpu import frame, mathematics
 from filterlab.ops.cpu.job import AXES
-from filterlab.ops.cpu.lanes import DOUBLE, I64, STORAGE, Lanes, Value
+from filterlab.ops.cpu.lanes import DOUBLE, I64, POINTER, STORAGE, Lanes, Value
 from filterlab.ops.cpu.optics import Lights, Located, Steps, TransferTable, optical_depth, shade
 from filterlab.ops.cpu.tape import Node, Tape
-from filterlab.ops.cpu.taps import Grid, Taps
+from filterlab.ops.cpu.taps import Grid, Location, Taps
 from filterlab.ops.cpu.traversal import Ray, Run, Segments, State, Traversal
 from filterlab.ops.derivatives import TABLE_ROW, gradient_columns
 from filterlab.ops.stencil import Lowered
@@ -137,36 +137,36 @@ class _Parts:
     parts: programs that are much longer are slow to read for a processor.
     """
 
-    def __init__(self, lanes: Lanes, part: Lanes, taps: Taps) -> None:
-        self.lanes, self.part, self.taps = lanes, part, taps
-        self.supports = taps.supports
-        self.count = I64(lanes.count // part.count)
-
-    def cells(self, points: Sequence[Value]) -> list[Value]:
-        """Along x, y, z: every lane's first tap, counted from coefficient 0 (32 bits)."""
-        split = [self.lanes.parts(own, self.part.count) for own in points]
-        parts = [[cell for cell, _ in self.taps.cells(own)] for own in zip(*split, strict=True)]
-        return [self.part.join(own) for own in zip(*parts, strict=True)]
+    def __init__(self, lanes: Lanes, taps: Taps) -> None:
+        self.lanes, self.builder, self.taps = lanes, lanes.builder, taps
+        self.location = Location(lanes, taps.supports, taps.storage, taps.grid)
 
     def contract(self, points: Sequence[Value], volume: Value) -> list[Value]:
         """The rows of the stencil."""
-        e, kept = self.lanes, [self.lanes.kept(own) for own in points]
-        rows = [e.kept() for _ in self.taps.stencil.rows]
-        with e.repeat(I64(0), self.count) as i:
-            offset, u = self.taps.locate([own.part(i, self.part.count) for own in kept])
-            addresses = self.taps.addresses(offset, volume)
+        rows = [self.lanes.kept() for _ in self.taps.stencil.rows]
+        with self._every_part(points, volume) as (i, addresses, u):
             found = self.taps.contract(addresses, I64(0), self.taps.weigh(u), u)
             for row, value in zip(rows, found, strict=True):
                 row.set_part(i, value)
-        return [row.all(e.count) for row in rows]
+        return [row.all(self.lanes.count) for row in rows]
 
     def spread(self, points: Sequence[Value], volume: Value, cotangents: Sequence[Value]) -> None:
         """The adjoint of that: add into the volume."""
-        e, kept, given = self.lanes, *([self.lanes.kept(own) for own in packs] for packs in (points, cotangents))
-        with e.repeat(I64(0), self.count) as i:
-            offset, u = self.taps.locate([own.part(i, self.part.count) for own in kept])
-            own = [cotangent.part(i, self.part.count) for cotangent in given]
-            self.taps.spread(self.taps.addresses(offset, volume), I64(0), self.taps.weigh(u), own)
+        given = [self.lanes.kept(cotangent) for cotangent in cotangents]
+        with self._every_part(points, volume) as (i, addresses, u):
+            own = [cotangent.part(i, self.taps.lanes.count) for cotangent in given]
+            self.taps.spread(addresses, I64(0), self.taps.weigh(u), own)
+
+    @contextmanager
+    def _every_part(self, points: Sequence[Value], volume: Value) -> Iterator[tuple[Value, list[Value], list[Value]]]:
+        """For every part its number, the addresses of its lanes' first taps, and their local coordinates."""
+        b, count = self.builder, self.taps.lanes.count
+        first, u = self.location.locate(points, volume)
+        addresses, local = self.lanes.kept(first), [self.lanes.kept(own) for own in u]
+        with self.lanes.repeat(I64(0), I64(self.lanes.count // count)) as i:
+            numbers = [b.add(b.mul(i, I64(count)), I64(lane)) for lane in range(count)]
+            pointers = [b.inttoptr(addresses.number(number), POINTER) for number in numbers]
+            yield i, pointers, [own.part(i, count) for own in local]
 
 
 class _Program:
@@ -194,14 +194,14 @@ class _Program:
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         self.grid = Grid.of(j)
         taps = self.of_coefficients(self.recipe.stencil)
-        self.taps = _Parts(e, self.part, taps)
+        self.taps = _Parts(e, taps)
         steps = Steps(j.steps_low, j.steps_scale, j.steps_last)
         tables = j.opacities, j.colors, j.intervals, j.buckets
         self.table, self.table_of_run = (
             TransferTable(lanes, self.recipe.interval, j.inner, *tables, steps) for lanes in (e, self.run)
         )
-        cells = _Parts(self.run, self.part, taps)
-        self.traversal = Traversal(self.run, j, cells, self.kept, self.recipe.skipping)
+        location = Location(self.run, taps.supports, self.storage, self.grid)
+        self.traversal = Traversal(location, j, self.kept, self.recipe.skipping)
         self.prepare()
         with frame.every_chunk(e, j) as chunk, self.traversal.every_block(chunk):
             self._march_block()
@@ -408,10 +408,10 @@ class _Adjoint(_Program):
         number = STORAGE[recipe.arithmetic]
         self.spreading = self.taps
         if number != self.storage:  # derivatives by the coefficients are kept in the arithmetic's type
-            self.spreading = _Parts(e, self.part, Taps(self.part, recipe.stencil, number, self.grid))
+            self.spreading = _Parts(e, Taps(self.part, recipe.stencil, number, self.grid))
         if recipe.derivatives is not None:
             self.raised = recipe.derivatives[1]
-            self.differentiating = _Parts(e, self.part, self.of_coefficients(recipe.derivatives[0]))
+            self.differentiating = _Parts(e, self.of_coefficients(recipe.derivatives[0]))
         self.columns = gradient_columns(recipe.lights if recipe.lit else None)
 
     def wants(self, name: str) -> bool:

@@ -15,7 +15,7 @@ from llvmlite import ir
 from filterlab.ops.cpu import frame
 from filterlab.ops.cpu.job import FIELDS
 from filterlab.ops.cpu.lanes import I1, I64, POINTER, STORAGE, Lanes, Value, Variable
-from filterlab.ops.cpu.taps import Grid, Taps
+from filterlab.ops.cpu.taps import Grid, Location, Taps
 from filterlab.ops.stencil import Lowered
 
 BLOCK = 16  # packs that are located before the first of them is summed
@@ -59,7 +59,9 @@ class _Program:
     def write(self) -> None:
         e = self.lanes
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
-        self.taps = Taps(e, self.recipe.stencil, self.storage, Grid.of(j))
+        grid = Grid.of(j)
+        self.location = Location(e, self.recipe.stencil.supports, self.storage, grid)
+        self.taps = Taps(e, self.recipe.stencil, self.storage, grid)
         self.scratch_points = e.reserve(e.number, 3 * e.count)
         self.scratch_rows = e.reserve(e.number, self.rows * e.count)
         self.addresses = e.reserve(I64, BLOCK * e.count)
@@ -90,8 +92,7 @@ class _Program:
         """Locate a pack's points and keep the result as number `index` of the block."""
         e, b = self.lanes, self.builder
         window = _Window(self, pack)
-        offset, u = self.taps.locate(e.load_triples(window.points(points)))
-        first_tap = b.add(offset, e.everywhere(b.ptrtoint(volume, I64)))
+        first_tap, u = self.location.locate(e.load_triples(window.points(points)), volume)
         e.store(first_tap, self._lane_of(self.addresses, index, 0, I64))
         for axis in range(3):
             e.store(u[axis], self._lane_of(self.local, b.mul(index, I64(3)), axis * e.count, e.number))

@@ -7,7 +7,7 @@ derivatives of one kernel.
 
 What is written for one pack of points:
 
-    locate     x, y, z -> first taps (integers) and u             (3 packs -> 3 packs)
+    locate     x, y, z -> address of the first tap, and u         (3 packs -> 3 packs and addresses)
     weigh      w[axis][function][t] = the weight of tap t, a polynomial in u
     for every line of taps (z, y):
         fetch      the coefficients of that line, for every lane: up to S packs
@@ -44,7 +44,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from types import SimpleNamespace
 
-from filterlab.ops.cpu.lanes import I32, I64, POINTER, Lanes, Storage, Value
+from filterlab.ops.cpu.lanes import I32, I64, Lanes, Storage, Value
 from filterlab.ops.stencil import Lowered
 
 _LINES_AT_ONCE = 4
@@ -91,6 +91,50 @@ class _Piece:
     offset: Value
 
 
+class Location:
+    """Writes where points lie among the coefficients.
+
+    Args:
+        lanes: writer of instructions.
+        supports: S along x, y, z.
+        storage: how coefficients lie in memory.
+        grid: where they lie.
+    """
+
+    def __init__(self, lanes: Lanes, supports: tuple[int, int, int], storage: Storage, grid: Grid) -> None:
+        self.lanes, self.builder = lanes, lanes.builder
+        self.supports, self.storage, self.grid = supports, storage, grid
+
+    def locate(self, points: Sequence[Value], volume: Value) -> tuple[Value, list[Value]]:
+        """The address of every lane's first tap (64 bits), and its local coordinates u along x, y, z.
+
+        Args:
+            points: packs of x, y, z.
+            volume: address of coefficient 0.
+        """
+        e, b = self.lanes, self.builder
+        (x, y, z), u = zip(*self.cells(points), strict=True)
+        size = I64(self.storage.bytes)
+        line = b.add(b.mul(z, e.everywhere(b.trunc(self.grid.height, I32))), y)
+        line_size = e.widen(e.everywhere(b.trunc(b.mul(self.grid.width, size), I32)))
+        offset = b.add(b.mul(e.widen(line), line_size), b.mul(e.widen(x), e.everywhere(size)))
+        return b.add(offset, e.everywhere(b.ptrtoint(volume, I64))), list(u)  # 64 bits: volumes may be large
+
+    def cells(self, points: Sequence[Value]) -> list[tuple[Value, Value]]:
+        """Along x, y, z: every lane's first tap, counted from coefficient 0 (32 bits), and its u."""
+        return [self._locate(point, axis) for axis, point in enumerate(points)]
+
+    def _locate(self, x: Value, axis: int) -> tuple[Value, Value]:
+        """First tap (from 0) and local coordinate; the start is subtracted from integers, u keeps all its digits."""
+        e, b = self.lanes, self.builder
+        low, high = (e.everywhere(e.scalar(end[axis])) for end in (self.grid.low, self.grid.high))
+        shifted = e.subtract(x, e.constant(self.supports[axis] / 2 - 1))
+        base = e.clamp(e.floor(shifted), low, high)
+        u = e.multiply_add(shifted, e.constant(0), e.subtract(shifted, base))  # 0 · ∞ = NaN: no value at infinity
+        start = e.everywhere(b.trunc(self.grid.start, I32))
+        return b.sub(e.to_integer(base), start), u
+
+
 class Taps:
     """Writes the sums of a stencil at the end of the current block. Make it before any loop: it reserves memory.
 
@@ -112,34 +156,8 @@ class Taps:
         self.read_at_once = _LINES_AT_ONCE if wide and len(stencil.rows) <= _ROWS_WITH_LINES else 1
         self._plane_weights = lanes.reserve(lanes.pack, self.supports[2] * len(stencil.functions[2]))
 
-    # --- where the points read, and with which weights ---
-
-    def locate(self, points: Sequence[Value]) -> tuple[Value, list[Value]]:
-        """Every lane's offset of its first tap, in bytes (64 bits), and its local coordinates u along x, y, z."""
-        e, b = self.lanes, self.builder
-        (x, y, z), u = zip(*self.cells(points), strict=True)
-        size = I64(self.storage.bytes)
-        line = b.add(b.mul(z, e.everywhere(b.trunc(self.grid.height, I32))), y)
-        line_size = e.widen(e.everywhere(b.trunc(b.mul(self.grid.width, size), I32)))
-        offset = b.add(b.mul(e.widen(line), line_size), b.mul(e.widen(x), e.everywhere(size)))
-        return offset, list(u)  # 64 bits from here on: volumes may be large
-
-    def cells(self, points: Sequence[Value]) -> list[tuple[Value, Value]]:
-        """Along x, y, z: every lane's first tap, counted from coefficient 0 (32 bits), and its u."""
-        return [self._locate(point, axis) for axis, point in enumerate(points)]
-
-    def _locate(self, x: Value, axis: int) -> tuple[Value, Value]:
-        """First tap (from 0) and local coordinate; the start is subtracted from integers, u keeps all its digits."""
-        e, b = self.lanes, self.builder
-        low, high = (e.everywhere(e.scalar(end[axis])) for end in (self.grid.low, self.grid.high))
-        shifted = e.subtract(x, e.constant(self.supports[axis] / 2 - 1))
-        base = e.clamp(e.floor(shifted), low, high)
-        u = e.multiply_add(shifted, e.constant(0), e.subtract(shifted, base))  # 0 · ∞ = NaN: no value at infinity
-        start = e.everywhere(b.trunc(self.grid.start, I32))
-        return b.sub(e.to_integer(base), start), u
-
     def weigh(self, u: Sequence[Value]) -> Weights:
-        """The weights of all taps. Those along z are also kept in memory: the loop over planes reads them there."""
+        """The weights of all taps, from `Location.locate`'s u; the loop over planes reads those along z from memory."""
         e = self.lanes
         weights: Weights = [
             [[e.polynomial(row, own) if any(row) else None for row in table] for table in functions]
@@ -155,12 +173,6 @@ class Taps:
         b = self.builder
         index = b.add(b.mul(z, I64(len(self.stencil.functions[2]))), I64(function))
         return self.lanes.advance(self._plane_weights, index, self.lanes.pack)
-
-    def addresses(self, offset: Value, volume: Value) -> list[Value]:
-        """Address of every lane's first tap, from the offsets that `locate` gives and the address of coefficient 0."""
-        b = self.builder
-        there = b.add(offset, self.lanes.everywhere(b.ptrtoint(volume, I64)))
-        return [b.inttoptr(b.extract_element(there, I32(lane)), POINTER) for lane in range(self.lanes.count)]
 
     # --- the sums ---
 

@@ -18,12 +18,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Protocol
 
 from llvmlite import ir
 
-from filterlab.ops.cpu.lanes import DOUBLE, I8, I32, I64, Lanes, Value, Variable
-from filterlab.ops.cpu.taps import Grid
+from filterlab.ops.cpu.lanes import DOUBLE, I8, I32, I64, Value, Variable
+from filterlab.ops.cpu.taps import Location
 
 RAYS_OF_A_BLOCK = 16
 
@@ -89,32 +88,20 @@ class Segments:
     thickness: Value
 
 
-class Footprint(Protocol):
-    """What the way through the rays has to know of the sums over taps."""
-
-    supports: tuple[int, int, int]
-
-    def cells(self, points: Sequence[Value]) -> list[Value]:
-        """Along x, y, z: every lane's first tap, counted from coefficient 0 (32 bits)."""
-        ...
-
-
 class Traversal:
     """Writes the loops over rays and their runs. Make it before any loop: it reserves memory.
 
     Args:
-        lanes: of a run.
+        location: where points of a run lie among the coefficients.
         job: fields of `ops.cpu.march.FIELDS`.
-        taps: they know where the taps of a run's points are.
         kept: names of the doubles that are kept of every ray from run to run; "depth" is one of them.
         skipping: whether empty bricks are left out.
     """
 
-    def __init__(
-        self, lanes: Lanes, job: SimpleNamespace, taps: Footprint, kept: Sequence[str], skipping: bool
-    ) -> None:
-        self.lanes, self.builder, self.job, self.taps, self.skipping = lanes, lanes.builder, job, taps, skipping
-        self.grid = Grid.of(job)
+    def __init__(self, location: Location, job: SimpleNamespace, kept: Sequence[str], skipping: bool) -> None:
+        self.location, self.job, self.skipping = location, job, skipping
+        self.lanes = lanes = location.lanes
+        self.builder = lanes.builder
         self._next = lanes.reserve(I64, RAYS_OF_A_BLOCK)
         self._kept = {name: lanes.reserve(DOUBLE, RAYS_OF_A_BLOCK) for name in kept}
 
@@ -327,12 +314,12 @@ class Traversal:
         start = self._smaller(b.fmul(b.fadd(b.fsub(index, one), ray.offset), j.step), ray.length)
         start = b.select(b.fcmp_ordered(">", start, DOUBLE(0.0)), start, DOUBLE(0.0))
         middle = b.fmul(b.fadd(start, end), DOUBLE(0.5))
-        bricks = []
+        grid, bricks = self.location.grid, []
         for axis in range(3):
             at = b.fadd(b.fmul(middle, ray.direction[axis]), ray.entry[axis])
-            shifted = b.fsub(at, DOUBLE(self.taps.supports[axis] / 2 - 1))
+            shifted = b.fsub(at, DOUBLE(self.location.supports[axis] / 2 - 1))
             cell = b.call(self._scalar_function("llvm.floor.f64"), [shifted])
-            low, high = self.grid.low[axis], self.grid.high[axis]
+            low, high = grid.low[axis], grid.high[axis]
             cell = b.select(b.fcmp_ordered(">", cell, low), cell, low)
             cell = b.sub(b.fptosi(self._smaller(cell, high), I64), j.start)
             bricks.append(b.ashr(cell, j.edge))
@@ -348,7 +335,7 @@ class Traversal:
         """Whether every point lies in an empty brick."""
         e, b, j = self.lanes, self.builder, self.job
         edge, by, bx = (e.everywhere(b.trunc(n, I32)) for n in (j.edge, j.bricks_y, j.bricks_x))
-        x, y, z = (b.ashr(cell, edge) for cell in self.taps.cells(points))
+        x, y, z = (b.ashr(cell, edge) for cell, _ in self.location.cells(points))
         index = b.add(b.mul(b.add(b.mul(z, by), y), bx), x)
         empty = None
         for lane in range(e.count):
