@@ -88,6 +88,9 @@ FIELDS: dict[str, type] = {
 }
 
 
+_WRITTEN_OUT = 12  # rows times planes, see `Taps`
+
+
 class Job(ctypes.Structure):
     _fields_ = list(FIELDS.items())
 
@@ -208,7 +211,7 @@ class _Program:
         b.ret_void()
 
     def of_coefficients(self, stencil: Lowered) -> Taps:
-        return Taps(self.part, stencil, self.storage, self.grid, self.recipe.room)
+        return Taps(self.part, stencil, self.storage, self.grid, self.recipe.room, written_out=_WRITTEN_OUT)
 
     def _march_block(self) -> None:
         with self.traversal.every_ray() as (number, state):

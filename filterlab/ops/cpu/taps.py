@@ -17,7 +17,8 @@ What is written for one pack of points:
 
 so that value and gradient of a 3×3×3 kernel cost 93 multiply-adds, not 27·4. `spread`, the adjoint of `contract`, runs
 the three sums backwards. Taps that a product has no weight for are neither read nor multiplied: NCRSI reads 32
-coefficients of its 4×4×4. Everything is written out but for the loop over planes of taps that look alike.
+coefficients of its 4×4×4. Everything is written out but for the loop over planes of taps that look alike, and that as
+well where it is short.
 
 The coefficients of one line lie together in memory, but a pack wants the first tap of every lane together, then the
 second tap of every lane. Collecting them one by one (a gather) is slow; instead every lane's line is read in one piece
@@ -39,7 +40,7 @@ Nothing outside the coefficients is touched: the first tap is clamped before it 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import groupby
 from types import SimpleNamespace
@@ -54,6 +55,8 @@ Measured with AVX-512 (Zen 5), coefficients in the cache: 0.8 times the time of 
 """
 _ROWS_WITH_LINES = 4
 """Sums of more rows need the registers themselves: the gradient to points of a tricubic jet took 1.25 × the time."""
+
+_WRITTEN_OUT = 6
 
 Weights = list[list[list[Value | None]]]
 """[axis][function][t]: the weight of tap t, a pack; None where the function has none."""
@@ -145,12 +148,24 @@ class Taps:
         grid: where they lie.
         room: whether the number behind the last coefficient may be read, so that three taps can be read as four.
             Measured (AVX-512, Zen 5): a march takes 0.97 times the time; jets of points gain nothing.
+        written_out: rows times planes up to which `contract` has no loop over planes. Measured there: a march takes
+            0.95 to 0.98 times the time (triquadratic, 1 or 4 rows), values at points 0.94 and 0.96 (tricubic); value and
+            gradient at points gain nothing.
     """
 
-    def __init__(self, lanes: Lanes, stencil: Lowered, storage: Storage, grid: Grid, room: bool = False) -> None:
+    def __init__(
+        self,
+        lanes: Lanes,
+        stencil: Lowered,
+        storage: Storage,
+        grid: Grid,
+        room: bool = False,
+        written_out: int = _WRITTEN_OUT,
+    ) -> None:
         self.lanes, self.builder = lanes, lanes.builder
         self.stencil, self.storage, self.grid = stencil, storage, grid
         self.supports, self.room = stencil.supports, room
+        self.written_out = len(stencil.rows) * stencil.supports[2] <= written_out
         wide = lanes.count * lanes.bits >= 512
         self.written_at_once = _LINES_AT_ONCE if wide else 1
         self.read_at_once = _LINES_AT_ONCE if wide and len(stencil.rows) <= _ROWS_WITH_LINES else 1
@@ -187,7 +202,7 @@ class Taps:
         """
         e = self.lanes
         rows = [e.variable(e.constant(0)) for _ in self.stencil.rows]
-        for planes in self._alike():
+        for planes in self._alike(apart=self.written_out):
             with self._every(planes, here) as (plane_offset, wz):
                 sums: dict[tuple[int, int], Value] = {}
                 pairs = self._pairs(wz)
@@ -271,12 +286,13 @@ class Taps:
 
     # --- which taps there are ---
 
-    def _alike(self) -> list[tuple[range, tuple[int, ...]]]:
-        """Runs of planes for which the same functions along z have a weight, with those functions."""
+    def _alike(self, apart: bool = False) -> list[tuple[range, tuple[int, ...]]]:
+        """Runs of planes (or planes apart) with the same functions that have a weight along z; and those functions."""
         functions = range(len(self.stencil.functions[2]))
         live = [tuple(c for c in functions if self.stencil.has(2, c, z)) for z in range(self.supports[2])]
         runs = [(key, [z for z, _ in group]) for key, group in groupby(enumerate(live), key=lambda item: item[1])]
-        return [(range(planes[0], planes[-1] + 1), key) for key, planes in runs if key]
+        found = [(range(planes[0], planes[-1] + 1), key) for key, planes in runs if key]
+        return [(range(z, z + 1), key) for planes, key in found for z in planes] if apart else found
 
     def _pairs(self, wz: dict[int, Value]) -> list[tuple[int, int]]:
         """The distinct (a, b) of products that have one of these functions along z."""
@@ -296,13 +312,16 @@ class Taps:
     def _every(self, planes: tuple[range, tuple[int, ...]], here: Value) -> Iterator[tuple[Value, dict[int, Value]]]:
         """for z in planes: the with-block, given the offset of the plane's first tap and the weights along z.
 
-        The one loop over taps that is not unrolled: programs are S times shorter and compile S times faster.
+        The one loop over taps that is not always unrolled: programs are S times shorter and compile S times faster.
         """
-        e, b, grid = self.lanes, self.builder, self.grid
         run, functions = planes
-        with e.repeat(I64(run.start), I64(run.stop)) as z:
-            own = {c: e.load(self._plane_weight(z, c), e.number, e.count) for c in functions}
-            yield e.opaque(b.add(here, b.mul(b.mul(z, grid.height), grid.width))), own
+        with self.lanes.repeat(I64(run.start), I64(run.stop)) if len(run) > 1 else nullcontext(I64(run.start)) as z:
+            yield self._plane(z, functions, here)
+
+    def _plane(self, z: Value, functions: Sequence[int], here: Value) -> tuple[Value, dict[int, Value]]:
+        e, b, grid = self.lanes, self.builder, self.grid
+        own = {c: e.load(self._plane_weight(z, c), e.number, e.count) for c in functions}
+        return e.opaque(b.add(here, b.mul(b.mul(z, grid.height), grid.width))), own
 
     # --- lines of taps in memory ---
 
