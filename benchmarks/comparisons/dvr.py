@@ -19,6 +19,7 @@ from filterlab.render import fused
 
 _BARS = {"direct": at_most("1/40"), "Dr.Jit loop": at_most("0.35"), "VTK fixed-point": at_most("0.3")}
 _STEPS = (200, 2000)
+_PROCESSES = 7  # pairs of them
 _LEAST = 2.0**20  # bytes; less counts as so much: it is chance
 
 
@@ -115,16 +116,25 @@ def _backward(settings: Settings) -> Race:
 
 
 def _memory(settings: Settings, tick: Tick) -> Outcome:
-    """Each number of steps in a process of its own; what is compared is the memory beyond that before rendering."""
+    """Both numbers of steps in turn, each time in a process of its own.
+
+    What is compared is the memory beyond that before rendering: a few MiB, of which the allocator's mood is a part.
+    """
     size = settings.image // 4
-    figures, beyond, whole = [], [], []
-    for done, steps in enumerate(_STEPS, start=1):
-        measure = measured("memory", threads=settings.threads, voxels=settings.image_voxels, size=size, steps=steps)
-        beyond.append(measure["peak"] - measure["before"])
-        whole.append(measure["peak"])
-        figures.append(_megabytes(f"{steps} steps, beyond what there was before", beyond[-1]))
-        tick(done / len(_STEPS))
+    beyond, whole = [], []
+    for done in range(_PROCESSES):
+        pair = [
+            measured("memory", threads=settings.threads, voxels=settings.image_voxels, size=size, steps=steps)
+            for steps in _STEPS
+        ]
+        beyond.append([measure["peak"] - measure["before"] for measure in pair])
+        whole.append([measure["peak"] for measure in pair])
+        tick((done + 1) / _PROCESSES)
     few, many = _STEPS
+    figures = [
+        _megabytes(f"{steps} steps, beyond what there was before", list(own))
+        for steps, own in zip(_STEPS, zip(*beyond, strict=True), strict=True)
+    ]
     return Outcome(
         name="memory",
         what=f"peak memory of forward + backward, triquadratic fused, lit, image {size}², volume "
@@ -137,13 +147,13 @@ def _memory(settings: Settings, tick: Tick) -> Outcome:
     )
 
 
-def _megabytes(name: str, value: float) -> Figure:
-    return Figure(name=name, spread=Spread.of([value / 2**20]), unit="MiB")
+def _megabytes(name: str, values: list[float]) -> Figure:
+    return Figure(name=name, spread=Spread.of([value / 2**20 for value in values]), unit="MiB")
 
 
-def _ratio(name: str, values: list[float], bar: Bar | None = None) -> Figure:
-    few, many = (max(value, _LEAST) for value in values)
-    return Figure(name=name, spread=Spread.of([many / few]), bar=bar)
+def _ratio(name: str, pairs: list[list[float]], bar: Bar | None = None) -> Figure:
+    ratios = [max(many, _LEAST) / max(few, _LEAST) for few, many in pairs]
+    return Figure(name=name, spread=Spread.of(ratios), bar=bar)
 
 
 _ITEMS: dict[str, tuple[float, Callable[[Settings], Race]]] = {

@@ -149,8 +149,8 @@ class Taps:
         room: whether the number behind the last coefficient may be read, so that three taps can be read as four.
             Measured (AVX-512, Zen 5): a march takes 0.97 times the time; jets of points gain nothing.
         written_out: rows times planes up to which `contract` has no loop over planes. Measured there: a march takes
-            0.95 to 0.98 times the time (triquadratic, 1 or 4 rows), values at points 0.94 and 0.96 (tricubic); value and
-            gradient at points gain nothing.
+            0.95 to 0.98 times the time (triquadratic, 1 or 4 rows), values at points 0.94 and 0.96 (tricubic);
+            values with gradients at points gain nothing.
     """
 
     def __init__(
