@@ -13,7 +13,6 @@ from filterlab.fields.ncrsi import NCRSI_TERMS
 from filterlab.fields.tensor_product import Direct, same_kernel
 from filterlab.kernels import CATMULL_ROM, CENTRAL_DIFFERENCE, KERNELS, LINEAR, TensorKernel, bspline
 from filterlab.ops import Product, Stencil, autograd, cpu, reference
-from filterlab.ops.cpu import order
 from tests.laws import assert_close
 
 SHAPE = (9, 8, 7)
@@ -201,7 +200,7 @@ def test_nan_and_infinite_points_give_nan_and_leave_their_neighbours_alone(name:
 @pytest.mark.parametrize("m", [16, 17, 45])  # sorting needs a pack of points: 16 floats with AVX-512
 @pytest.mark.parametrize("name", ["quadratic", "ncrsi, central", "trilinear, central"])
 def test_pull_is_the_adjoint_to_the_points(name: str, m: int, sorting: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(order, "pays", lambda *_: sorting)
+    monkeypatch.setattr(cpu, "_sorting_pays", lambda *_: sorting)
     stencil = SUMS.get(name) or Stencil.jet(bspline(2), 1)
     for dtype in (torch.float32, torch.float64):
         if stencil.order >= cpu.MAX_ORDER:

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from filterlab.ops.cpu.order import Sorted
     from filterlab.ops.placement import Placement
 
+FEWEST_SORTED = 1 << 16  # points of a batch entry
+SMALLEST_SORTED_IN = 16 << 20  # bytes of one channel
 SPLAT_MEMORY = 1 << 30  # bytes that scatter may take for partial results beyond the result itself
 
 _ARITHMETIC = {torch.float32: "float32", torch.float64: "float64"}
@@ -155,9 +157,12 @@ def pull(coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: Sten
 
 
 def _sorting_pays(points: Tensor, shape: Sequence[int], bytes_each: int) -> bool:
+    """Whether sorting points (N, M, 3) costs less than it saves (`order`); nothing is imported where it can't."""
+    if points.shape[1] < FEWEST_SORTED or math.prod(shape[2:]) * bytes_each < SMALLEST_SORTED_IN:
+        return False
     from filterlab.ops.cpu import order
 
-    return order.pays(points, math.prod(shape[2:]) * bytes_each)
+    return order.scattered(points)
 
 
 def _in_order(points: Tensor, shape: Sequence[int], start: int) -> Iterator[tuple[int, slice, Sorted]]:

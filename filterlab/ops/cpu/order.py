@@ -34,17 +34,10 @@ from torch import Tensor
 from filterlab.ops.cpu import compiler, sorting
 from filterlab.ops.cpu.sorting import AXES, Job, Recipe
 
-FEWEST_POINTS = 1 << 16  # of a batch entry
-SMALLEST_VOLUME = 16 << 20  # bytes of one channel
 POINTS_AT_ONCE = 1 << 22  # points that are sorted together, for which copies of points and rows are held
 _EDGE = 8  # of a brick
 _MOST_BRICKS = 1 << 16
 _LOOKED_AT = 2048
-
-
-def pays(points: Tensor, volume_bytes: int) -> bool:
-    """Whether sorting points (N, M, 3) costs less than it saves; a channel of the volume has so many bytes."""
-    return points.shape[1] >= FEWEST_POINTS and volume_bytes >= SMALLEST_VOLUME and scattered(points)
 
 
 def scattered(points: Tensor) -> bool:
