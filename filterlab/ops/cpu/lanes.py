@@ -90,11 +90,13 @@ class Kept:
         return b.load(start, typ=ir.VectorType(self._element, count), align=_size(self._element))
 
     def set_part(self, index: Value, value: Value) -> None:
+        """Write part number `index`, as many lanes as `value` has."""
         b = self._builder
         start = b.gep(self._place, [b.mul(index, I64(value.type.count))], source_etype=self._element)
         b.store(value, start, align=_size(self._element))
 
     def all(self, count: int) -> Value:
+        """The whole pack, of `count` lanes."""
         return self.part(I64(0), count)
 
     def number(self, index: Value) -> Value:

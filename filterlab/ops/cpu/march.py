@@ -298,7 +298,7 @@ class _Program:
 
 @dataclass(frozen=True)
 class _Sample:
-    """What was computed for a pack, as nodes whose adjoints are asked.
+    """What was computed for a run, as nodes whose adjoints are asked.
 
     Attributes:
         segments, located: where it is, in space and in the transfer function.
@@ -364,9 +364,14 @@ class _March(_Program):
         return self.lanes.parts(pack, self.run.count)
 
     def _segments(self, *runs: Run) -> Segments:
-        first, second = (vars(self.traversal.segments(run.ray, run.first)) for run in runs)
-        points = [self.run.join(pair) for pair in zip(first.pop("points"), second.pop("points"), strict=True)]
-        return Segments(points=points, **{name: self.run.join((first[name], second[name])) for name in first})
+        own, join = [self.traversal.segments(run.ray, run.first) for run in runs], self.run.join
+        return Segments(
+            real=join([one.real for one in own]),
+            last=join([one.last for one in own]),
+            middle=join([one.middle for one in own]),
+            points=[join(axis) for axis in zip(*(one.points for one in own), strict=True)],
+            thickness=join([one.thickness for one in own]),
+        )
 
     def _compose(self, first: Run, second: Run, same: Value, tau: list[Value], absorbed: list[Value]) -> list[Value]:
         """The weights of two runs; adds their optical depths τ to those of their rays.
