@@ -19,7 +19,7 @@ from filterlab.render import fused
 
 _BARS = {"direct": at_most("1/40"), "Dr.Jit loop": at_most("0.35"), "VTK fixed-point": at_most("0.3")}
 _STEPS = (200, 2000)
-_PROCESSES = 7  # pairs of them
+_PROCESSES = 5  # pairs of them
 _LEAST = 2.0**20  # bytes; less counts as so much: it is chance
 
 
@@ -118,9 +118,9 @@ def _backward(settings: Settings) -> Race:
 def _memory(settings: Settings, tick: Tick) -> Outcome:
     """Both numbers of steps in turn, each time in a process of its own.
 
-    What is compared is the memory beyond that before rendering: a few MiB, of which the allocator's mood is a part.
+    What is compared is the memory beyond that before rendering; of smaller images the allocator's mood is most of it.
     """
-    size = settings.image // 4
+    size = settings.image
     beyond, whole = [], []
     for done in range(_PROCESSES):
         pair = [
