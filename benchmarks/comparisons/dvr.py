@@ -19,7 +19,7 @@ from filterlab.render import fused
 
 _BARS = {"direct": at_most("1/40"), "Dr.Jit loop": at_most("0.35"), "VTK fixed-point": at_most("0.3")}
 _STEPS = (200, 2000)
-_PROCESSES = 5  # pairs of them
+_PROCESSES = 7  # pairs of them
 _LEAST = 2.0**20  # bytes; less counts as so much: it is chance
 
 
@@ -118,7 +118,8 @@ def _backward(settings: Settings) -> Race:
 def _memory(settings: Settings, tick: Tick) -> Outcome:
     """Both numbers of steps in turn, each time in a process of its own.
 
-    What is compared is the memory beyond that before rendering; of smaller images the allocator's mood is most of it.
+    What is compared is the memory beyond that before rendering, the least with the least and so on to the most: it
+    differs by some MiB from process to process.
     """
     size = settings.image
     beyond, whole = [], []
@@ -152,7 +153,8 @@ def _megabytes(name: str, values: list[float]) -> Figure:
 
 
 def _ratio(name: str, pairs: list[list[float]], bar: Bar | None = None) -> Figure:
-    ratios = [max(many, _LEAST) / max(few, _LEAST) for few, many in pairs]
+    ranks = zip(*(sorted(own) for own in zip(*pairs, strict=True)), strict=True)
+    ratios = [max(many, _LEAST) / max(few, _LEAST) for few, many in ranks]
     return Figure(name=name, spread=Spread.of(ratios), bar=bar)
 
 
