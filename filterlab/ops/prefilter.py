@@ -231,10 +231,11 @@ def _adjoint(
     if boundary is Boundary.ZEROS:
         return _fused(cotangents, dims, prefilter, boundary, -tail)
     if boundary.periodic:
-        out = cotangents.clone()
+        mirrored = boundary is Boundary.MIRROR
+        out = cotangents.clone() if tail or mirrored else cotangents  # to be written to
         for dim in dims if tail else ():
             out = _fold(out, dim, boundary, shape[dim], tail)
-        if boundary is not Boundary.MIRROR:
+        if not mirrored:
             return _fused(out, dims, prefilter, boundary, 0)
         return _at_mirrors(_own(_fused(_at_mirrors(out, dims, 2.0), dims, prefilter, boundary, 0)), dims, 0.5)
     beyond = prefilter.decay(cotangents.dtype)

@@ -82,7 +82,7 @@ class FusedMarcher:
         return _Differentiable.apply(given, self.memory, report, *given.parameters)  # type: ignore[return-value]
 
     def _empty_parts(self, medium: Medium) -> Bricks | None:
-        """Of the medium marched through last, found once for all of its tiles."""
+        """Of the medium marched through last, found once for all parts of an image."""
         if self._empty is None or self._empty[0] is not medium:
             self._empty = medium, _empty_parts(medium)
         return self._empty[1]

@@ -3,7 +3,7 @@
 Letters: R rays, K samples of each ray in a block, S = samples of a block that exist (no more than R K), s the length of
 a segment, τ its optical depth, T transmittance. Geometry (rays, distances) is float64; samples are `dtype`.
 
-How work is cut up never changes a number: blocks have K consecutive segments of a ray wherever the tile's edge is, and
+How work is cut up never changes a number: blocks have K consecutive segments of a ray wherever a part's edge is, and
 sums over them have a fixed order.
 """
 
@@ -24,7 +24,7 @@ from filterlab.render.shading import Shading
 from filterlab.render.transfer import TransferFunction, absorbed
 
 Report = Callable[[int], None]
-"""Is told how many samples of the current tile are done."""
+"""Is told how many samples of the current part are done."""
 
 BLOCK = 32  # K, consecutive segments of a ray that are composited together; a power of two
 _FLOATS_PER_SAMPLE = 160  # what a field of 27 taps and the marcher hold at a time, measured
@@ -85,7 +85,7 @@ class Medium:
 
 
 class Marcher(Protocol):
-    """Marches tiles of rays through a medium."""
+    """Marches parts of an image's rays through a medium."""
 
     def march(self, medium: Medium, chords: Chords, report: Report) -> tuple[Tensor, Tensor]:
         """Emitted light (R, 3) and optical depth (R,), float64."""

@@ -215,16 +215,16 @@ class Lanes:
 
     def running_sums(self, a: Value) -> Value:
         """Lane i gets the sum of lanes 0 … i, in log₂P steps."""
-        by = 1
-        while by < self.count:
-            a, by = self.add(a, self.delayed(a, by)), 2 * by
-        return a
+        return self._running(a, self.add, neutral=0)
 
     def running_products(self, a: Value) -> Value:
         """Lane i gets the product of lanes 0 … i, in log₂P steps."""
+        return self._running(a, self.multiply, neutral=1)
+
+    def _running(self, a: Value, combine: Callable[[Value, Value], Value], neutral: float) -> Value:
         by = 1
         while by < self.count:
-            a, by = self.multiply(a, self.delayed(a, by, first=1)), 2 * by
+            a, by = combine(a, self.delayed(a, by, neutral)), 2 * by
         return a
 
     def total(self, a: Value) -> Value:

@@ -462,7 +462,7 @@ class _Adjoint(_Program):
 
     @contextmanager
     def _if_it_counts(self, located: Located, segments: Segments) -> Iterator[None]:
-        """The with-block, unless the pack has neither opacity nor derivatives."""
+        """The with-block, unless the run has neither opacity nor derivatives."""
         if self.wants("table"):  # a control point's opacity counts where it is 0, too
             yield
         else:
