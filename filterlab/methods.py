@@ -27,7 +27,7 @@ from filterlab.fields.tensor_product import (
     same_kernel,
 )
 from filterlab.kernels import Kernel, PiecewisePolynomial, TensorKernel
-from filterlab.ops import autograd
+from filterlab.ops.differentiable import gather
 from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary, Volume, as_volume
 
@@ -318,5 +318,5 @@ def _missing_for_fused(coefficients: Coefficients, scheme: Direct) -> str | None
     """What the fused sum lacks for these coefficients, or None."""
     values = coefficients.values.detach().reshape(-1, 1, *coefficients.values.shape[-3:])
     points = torch.empty(values.shape[0], 0, 3, device=values.device)
-    missing = autograd.MISSING[implementation_of("fused", values.device)]
-    return missing(values, points, scheme.stencils[1], None, coefficients.start)
+    implementation = implementation_of("fused", values.device)
+    return gather.missing(implementation, values, points, scheme.stencils[1], None, coefficients.start)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from filterlab.ops import autograd
+from filterlab.ops.differentiable.recording import transformed
 
 NanChoice = Literal["refuse", "propagate", "fill"]
 CHOICES: tuple[str, ...] = get_args(NanChoice)
@@ -33,7 +33,7 @@ def resolved(samples: Tensor, choice: str) -> tuple[Tensor, Tensor | None]:
     """
     if choice not in CHOICES:
         raise ValueError(f"nan must be one of {', '.join(CHOICES)}; got {choice!r}")
-    if not samples.dtype.is_floating_point or autograd.transformed() or _all_finite(samples):
+    if not samples.dtype.is_floating_point or transformed() or _all_finite(samples):
         return samples, None
     unknown = ~samples.detach().isfinite()
     if not bool(unknown.any()):  # finite numbers whose sum is not

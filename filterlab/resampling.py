@@ -11,7 +11,7 @@ from torch import Tensor
 from filterlab.fields.grid import GridField, Term
 from filterlab.kernels import PiecewisePolynomial
 from filterlab.methods import Method, reconstruct
-from filterlab.ops.reference import locate, tap_weights
+from filterlab.ops.reference.gather import locate, tap_weights
 from filterlab.volume import Boundary, Geometry, Volume, as_volume
 
 POINTS_AT_ONCE = 1 << 20

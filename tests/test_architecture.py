@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import subprocess
 import sys
 from pathlib import Path
@@ -69,6 +70,68 @@ def test_imports_point_one_way(path):
         assert FLOORS[other] < FLOORS[own], (
             f"{path.relative_to(ROOT)} imports filterlab.{other}, which stands above or beside it"
         )
+
+
+# the rooms of ops, the same way; a file beside them is the description of an op, or what is summed
+OPS_FLOORS = {"descriptions": 0, "reference": 1, "cpu": 2, "cuda": 2, "differentiable": 3, "__init__": 4}
+
+
+def room_of_ops(path: Path) -> str:
+    _, *parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return parts[0] if len(parts) > 1 or parts[0] == "__init__" else "descriptions"
+
+
+def files_imported(path: Path) -> set[Path]:
+    """The files of the package that a file imports, wherever the import stands, for type checkers only too."""
+    found = set()
+    for name in imported_modules(path):
+        parts = name.split(".")
+        if parts[0] == "filterlab":
+            choices = (PACKAGE.parent.joinpath(*parts[:n]) for n in (len(parts), len(parts) - 1))
+            files = (f for c in choices for f in (c.with_suffix(".py"), c / "__init__.py") if f.is_file())
+            found |= set(itertools.islice(files, 1))
+    return found - {path}
+
+
+@pytest.mark.parametrize("path", sorted((PACKAGE / "ops").rglob("*.py")), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_within_ops_point_one_way(path):
+    own = room_of_ops(path)
+    for other in files_imported(path):
+        if other.is_relative_to(PACKAGE / "ops") and (room := room_of_ops(other)) != own:
+            assert OPS_FLOORS[room] < OPS_FLOORS[own], f"{path.relative_to(ROOT)} imports {other.relative_to(ROOT)}"
+
+
+def circles(imports: dict[Path, set[Path]]) -> list[Path]:
+    """The files that can be reached from themselves."""
+
+    def reached(start: Path) -> set[Path]:
+        seen: set[Path] = set()
+        left = list(imports[start])
+        while left:
+            if (at := left.pop()) not in seen:
+                seen.add(at)
+                left += imports[at]
+        return seen
+
+    return sorted(path for path in imports if path in reached(path))
+
+
+def test_no_files_import_each_other_in_a_circle():
+    found = circles({path: files_imported(path) for path in SOURCES})
+    assert not found, "in circles: " + ", ".join(str(path.relative_to(PACKAGE)) for path in found)
+
+
+def test_a_circle_is_found(tmp_path):
+    a, b, c, d = (tmp_path / name for name in "abcd")
+    assert circles({a: {b}, b: {c}, c: {a}, d: {a}}) == [a, b, c]
+    assert circles({a: {b, c}, b: {c}, c: set(), d: {a}}) == []
+
+
+def test_every_op_has_its_parts():
+    """A description, a plain twin, vector code, and what makes it differentiable; on a GPU as far as there is one."""
+    for op in ("gather", "place", "prefilter", "march"):
+        for room in ("", "reference", "cpu", "differentiable"):
+            assert (PACKAGE / "ops" / room / f"{op}.py").is_file(), f"{op} has no {room or 'description'}"
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))

@@ -10,7 +10,7 @@ import torch
 from scipy import ndimage
 
 from filterlab.kernels import KERNELS, Kernel, bspline
-from filterlab.ops.prefilter import prefilter_axis, prefilter_samples
+from filterlab.ops.differentiable.prefilter import prefilter_axis, prefilter_samples
 from filterlab.prefilters import PREFILTERS, interpolation
 from filterlab.volume import Boundary
 from tests import laws, oracles

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from filterlab.fields.base import Field
 from filterlab.fields.tensor_product import SAMPLERS, exact_sample
 from filterlab.kernels import bc
 from filterlab.methods import METHODS, reconstruct
-from filterlab.ops import autograd
+from filterlab.ops.differentiable.gather import IMPLEMENTATIONS
 from filterlab.volume import Boundary
 from tests import laws, oracles
 
@@ -179,7 +181,7 @@ def test_the_default_is_fused_where_it_can_run(monkeypatch):
     kernel = bc(torch.tensor(0.3), torch.tensor(0.3))
     assert reconstruct(volume(), kernel, prefilter=False).scheme.name == "direct"
     assert reconstruct(volume(), "notch").scheme.name == "fused"
-    monkeypatch.setitem(autograd.MISSING, "cpu", lambda *_: "no such thing")
+    monkeypatch.setitem(IMPLEMENTATIONS, "cpu", replace(IMPLEMENTATIONS["cpu"], missing=lambda *_: "no such thing"))
     assert reconstruct(volume(), "notch").scheme.name == "direct"
     with pytest.raises(ValueError, match="no such thing"):
         reconstruct(volume(), "notch", scheme="fused")

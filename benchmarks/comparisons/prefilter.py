@@ -11,7 +11,7 @@ from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_i
 from benchmarks.peers import scipy_ndimage
 from benchmarks.records import Bar, at_most
 from benchmarks.settings import Settings
-from filterlab.ops.prefilter import prefilter_samples
+from filterlab.ops.differentiable.prefilter import prefilter_samples
 
 _ORDERS = {"quadratic": 2, "cubic": 3}
 _BAR = at_most("0.2")

@@ -15,7 +15,7 @@ import torch
 from benchmarks.harness import Contestant
 from benchmarks.peers.drjit_texture import missing, positions, started, texture_of
 from benchmarks.scene import LIGHTING, Scene
-from filterlab.ops.prefilter import prefilter_samples
+from filterlab.ops.differentiable.prefilter import prefilter_samples
 from filterlab.render.rays import intersect
 
 __all__ = ["NAME", "marching", "missing"]

@@ -26,11 +26,11 @@ from experiments.extremes.coordinates import largest
 from filterlab.fields.grid import GridField
 from filterlab.fields.tensor_product import reach_of
 from filterlab.kernels import bspline
-from filterlab.ops import Stencil, cpu, gather
-from filterlab.ops.cpu import compiler
+from filterlab.ops import Stencil, gather
+from filterlab.ops.cpu.gather import Program, scatter
+from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.cpu.points import BLOCK
 from filterlab.render import TransferFunction, render
-from filterlab.volume import Geometry
 
 EDGE, CORNER = 1300, 24  # voxels along an axis, of the volume and of its corner that is written to; 1300³ > 2³¹
 POINTS = 2**31 + 5
@@ -66,8 +66,8 @@ def field_over(subject: Subject, coefficients: Tensor, first: int) -> GridField:
     built = fl.reconstruct(few, subject.method, scheme=subject.scheme, gradient=gradient, prefilter=False)
     assert isinstance(built, GridField)
     size = (coefficients.shape[2], coefficients.shape[1], coefficients.shape[0])
-    built.coefficients = replace(built.coefficients, values=coefficients, start=first, size=size, quantization=None)
-    built.placement = built.coefficients.placement(Geometry())
+    vast = replace(built.coefficients, values=coefficients, start=first, size=size, quantization=None)
+    built = built.with_coefficients(vast)
     built.domain = replace(built.domain, upper=(size[0] - 0.5, size[1] - 0.5, size[2] - 0.5))
     return built
 
@@ -121,8 +121,8 @@ def scatter_into_many(_subject: Subject, random: np.random.Generator, amount: fl
         return Finding(0, 0.0, 0.0, skipped=memory)
     vast = torch.frombuffer(memory, dtype=torch.float32)[:-1].reshape(1, 1, EDGE, EDGE, EDGE)
     stencil = Stencil.jet(bspline(2), 1)
-    cpu._run("scatter", [vast], points + (EDGE - CORNER), cotangents, stencil, 0)
-    expected = cpu.scatter(cotangents, points, stencil, (CORNER,) * 3)
+    Program.of("scatter", vast, stencil, 0, vast.dtype).divide([vast], points + (EDGE - CORNER), cotangents)
+    expected = scatter(cotangents, points, stencil, (CORNER,) * 3)
     found = vast[..., -CORNER:, -CORNER:, -CORNER:]
     tally.error(largest(found - expected) / largest(expected), "something else was added to the corner", count)
     tally.kept(largest(expected) > 0.1, "nothing was added")
@@ -143,7 +143,7 @@ def many_points(_subject: Subject, random: np.random.Generator, amount: float) -
     stencil = Stencil.jet(bspline(2), 1)
 
     with mock.patch("filterlab.ops.cpu.threads.run", lambda function, jobs: _run_the_last(function, jobs[0], count)):
-        cpu._run("gather", [coefficients], points, rows, stencil, 0)
+        Program.of("gather", coefficients, stencil, 0, points.dtype).share(coefficients, points, rows)
     expected = gather(coefficients, points[:, -count:].clone(), stencil, 0, "cpu")
     tally.kept(torch.equal(rows[..., -count:], expected), "other bits than those points alone", count)
     tally.kept(largest(expected) > 0.1, "the rows are empty")
@@ -152,7 +152,7 @@ def many_points(_subject: Subject, random: np.random.Generator, amount: float) -
 
 def _run_the_last(function: Callable[[int], object], job: Any, count: int) -> None:
     """Only the chunks that hold the last `count` points, on this thread."""
-    lanes = cpu._lanes(compiler.features(), 4)
+    lanes = lanes_of(torch.float32)
     packs = -(-job.count // lanes)
     job.chunk = BLOCK
     job.chunks = -(-packs // BLOCK)

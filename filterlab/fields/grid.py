@@ -7,7 +7,7 @@ of gradients flipped where a reflection turned an axis round, and every boundary
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -15,12 +15,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from filterlab import ops
 from filterlab.fields.base import Domain, Field, check_order, check_points
 from filterlab.fields.storage import Quantization, stored_as
 from filterlab.kernels import Factor, PiecewisePolynomial
-from filterlab.ops.placement import Placement
-from filterlab.ops.prefilter import implementation_for, prefilter_samples
+from filterlab.ops.differentiable.prefilter import implementation_for, prefilter_samples
+from filterlab.ops.place import Placement
 from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary, Geometry, Volume
 
@@ -55,9 +54,17 @@ class Scheme(Protocol):
     @property
     def terms(self) -> tuple[Term, ...]: ...
 
-    def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
-        """Located points (N, M, 3) -> (N, C, J, M), rows as in `multi_indices(order)`."""
+    def evaluation(self, coefficients: Coefficients, placement: Placement, order: int) -> Evaluation:
+        """What gives the jet of that order of coefficients (N, C, D', H', W'); all that no point changes is settled.
+
+        Nothing is asked of it that the scheme cannot do: `reconstruct` has found out.
+        """
         ...
+
+
+Evaluation = Callable[[Tensor], tuple[Tensor, Tensor | None]]
+"""World points (N, M, 3) -> (N, C, J, M), rows as in `multi_indices(order)`, before points were turned; sign of
+`ops.place`, or None."""
 
 
 @dataclass(frozen=True)
@@ -172,10 +179,28 @@ class GridField(Field):
         self.method = method
         self.scheme = scheme
         self.coefficients = coefficients
-        self.placement = coefficients.placement(volume.geometry)
         self.domain = Domain.of_grid(volume.size, volume.geometry)
         self.max_order = scheme.max_order
         self.channels = (volume.shape[0], volume.shape[1]) if volume.batched else None
+        self._settle()
+
+    def _settle(self) -> None:
+        """Decide everything that points don't: for points of every entry, and for points that all entries share."""
+        values = self.coefficients.values
+        own = values if self.channels is not None else values[None, None]
+        self._own = self._evaluations(own)
+        self._shared = self._own
+        if own.shape[0] != 1:
+            self._shared = self._evaluations(own.reshape(1, own.shape[0] * own.shape[1], *own.shape[2:]))
+
+    def _evaluations(self, values: Tensor) -> list[Evaluation]:
+        coefficients, placement = replace(self.coefficients, values=values), self.placement
+        return [self.scheme.evaluation(coefficients, placement, order) for order in range(self.max_order + 1)]
+
+    @property
+    def placement(self) -> Placement:
+        """How world points become coordinates of the coefficients."""
+        return self.coefficients.placement(self.domain.geometry)
 
     def __repr__(self) -> str:
         scheme, values = self.scheme, self.coefficients.values
@@ -195,55 +220,59 @@ class GridField(Field):
         if self.channels is None:
             raise ValueError("select needs a batched field, of a volume (N, C, D, H, W); this one is unbatched")
         one = copy(self)
-        one.coefficients = self.coefficients[n, c]
-        one.channels = None
+        one.coefficients, one.channels = self.coefficients[n, c], None
+        one._settle()
+        return one
+
+    def with_coefficients(self, coefficients: Coefficients) -> GridField:
+        """The same field of other coefficients, which lie as these do."""
+        one = copy(self)
+        one.coefficients = coefficients
+        one._settle()
         return one
 
     def _relative_to(self, origin: tuple[float, float, float]) -> GridField:
         """The grid moves instead: numbers of float64, no work for any point."""
         moved = copy(self)
         moved.domain = self.domain.relative_to(origin)
-        moved.placement = replace(self.placement, geometry=moved.domain.geometry)
+        moved._settle()
         return moved
 
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         check_order(order, self.max_order)
         points = check_points(points, self.channels)
-        batched = points if self.channels is not None else points[None]
-        flat = batched.reshape(batched.shape[0], math.prod(batched.shape[1:-1]), 3)
-        implementation = implementation_of(self.scheme.name, self.coefficients.values.device)
-        located, sign = ops.place(flat, self.placement, implementation)
-        rows = self._rows(located, order)  # (N, C, J, M)
-        shape = batched.shape[1:-1]
-        out = [self._shaped(rows[:, :, 0], shape)]
+        shape = points.shape[:-1] if self.channels is None else points.shape[1:-1]
+        flat = points.reshape(1 if self.channels is None else points.shape[0], math.prod(shape), 3)
+        evaluations = self._own if self.channels is None or len(flat) == self.channels[0] else self._shared
+        rows, sign = evaluations[order](flat)
+        value, *others = self._decoded(rows).split_with_sizes(_ROWS[: order + 1], 2)
+        out = [self._shaped(value[:, :, 0] if self.channels is not None else value, shape)]
         if order >= 1:
-            gradient = rows[:, :, 1:4].movedim(2, -1)
+            gradient = others[0].movedim(2, -1)
             if sign is not None:
                 gradient = gradient * sign[:, None]
-            out.append(self._shaped(self.domain.geometry.gradient_to_world(gradient), shape))
+            out.append(self._shaped(self.domain.geometry.gradient_to_world(gradient), shape, 3))
         if order >= 2:
-            hessian = _symmetric(rows[:, :, 4:10])
+            hessian = _symmetric(others[1])
             if sign is not None:
                 hessian = hessian * (sign[..., :, None] * sign[..., None, :])[:, None]
-            out.append(self._shaped(self.domain.geometry.hessian_to_world(hessian), shape))
+            out.append(self._shaped(self.domain.geometry.hessian_to_world(hessian), shape, 3, 3))
         return tuple(out)
 
-    def _rows(self, located: Tensor, order: int) -> Tensor:
-        """The scheme's jet; one set of points for a whole batch is evaluated once, with the batch as channels."""
-        values = self.coefficients.values if self.channels is not None else self.coefficients.values[None, None]
-        n, c = values.shape[:2]
-        shared = located.shape[0] != n
-        if shared:
-            values = values.reshape(1, n * c, *values.shape[2:])
-        rows = self.scheme.jet(replace(self.coefficients, values=values), located, order)
-        rows = rows.reshape(n, c, *rows.shape[2:]) if shared else rows
+    def _decoded(self, rows: Tensor) -> Tensor:
+        """Rows (N, C, J, M) of what stored integers stand for, and of a shared batch entry by entry."""
+        if self.channels is not None and rows.shape[:2] != self.channels:
+            rows = rows.reshape(*self.channels, *rows.shape[2:])
         quantization = self.coefficients.quantization
         return rows if quantization is None else quantization.of_rows(rows)
 
-    def _shaped(self, x: Tensor, shape: Sequence[int]) -> Tensor:
-        """(N, C, M, ...) to (N, C, *P, ...), or (*P, ...) for an unbatched field."""
-        x = x.reshape(*x.shape[:2], *shape, *x.shape[3:])
-        return x if self.channels is not None else x[0, 0]
+    def _shaped(self, x: Tensor, shape: Sequence[int], *own: int) -> Tensor:
+        """(N, C, M, *own) to (N, C, *P, *own), or (*P, *own) for an unbatched field."""
+        return x.reshape(*(self.channels or ()), *shape, *own)
+
+
+_ROWS = (1, 3, 6)
+"""Rows of a jet that are its value, its gradient, its Hessian."""
 
 
 def _symmetric(rows: Tensor) -> Tensor:

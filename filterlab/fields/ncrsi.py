@@ -20,7 +20,14 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from filterlab.fields.grid import Coefficients, Term
-from filterlab.fields.tensor_product import Sampler, along, unit_steps, with_central_differences, with_exact_positions
+from filterlab.fields.tensor_product import (
+    Sampled,
+    Sampler,
+    along,
+    unit_steps,
+    with_central_differences,
+    with_exact_positions,
+)
 from filterlab.kernels import CATMULL_ROM, LINEAR
 
 NCRSI_TERMS: tuple[Term, ...] = (
@@ -30,7 +37,7 @@ NCRSI_TERMS: tuple[Term, ...] = (
 
 
 @dataclass(frozen=True)
-class SevenSamples:
+class SevenSamples(Sampled):
     """NCRSI from seven trilinear samples, and central differences from the same seven."""
 
     sample: Sampler

@@ -8,9 +8,10 @@ texture unit.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, wraps
+from functools import cached_property, partial, wraps
 from itertools import product
 from typing import Any, TypeVar
 
@@ -18,9 +19,10 @@ import torch
 from torch import Tensor
 
 from filterlab import ops
-from filterlab.fields.grid import Coefficients, Term, implementation_of
+from filterlab.fields.grid import Coefficients, Evaluation, Term, implementation_of
 from filterlab.kernels import CENTRAL_DIFFERENCE, LINEAR, PiecewisePolynomial, bspline, horner
 from filterlab.ops import Product, Stencil, multi_indices
+from filterlab.ops.place import Placement
 
 Sampler = Callable[[Coefficients, Tensor], Tensor]
 """(coefficients with values (N, C, D, H, W), points (N, M, 3)) -> trilinear samples (N, C, M).
@@ -137,13 +139,33 @@ class Direct:
             for order in range(self.max_order + 1)
         )
 
+    def evaluation(self, coefficients: Coefficients, placement: Placement, order: int) -> ops.Evaluation:
+        values, start = coefficients.values, coefficients.start
+        return ops.Evaluation(
+            values, placement, self.stencils[order], start, implementation_of(self.name, values.device)
+        )
+
+
+class Sampled(ABC):
+    """A scheme that places points and takes trilinear samples of the coefficients there."""
+
+    @abstractmethod
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
-        implementation = implementation_of(self.name, coefficients.values.device)
-        return ops.gather(coefficients.values, points, self.stencils[order], coefficients.start, implementation)
+        """Located points (N, M, 3) -> (N, C, J, M), rows as in `multi_indices(order)`."""
+
+    def evaluation(self, coefficients: Coefficients, placement: Placement, order: int) -> Evaluation:
+        return partial(self._evaluate, coefficients, placement, order)
+
+    def _evaluate(
+        self, coefficients: Coefficients, placement: Placement, order: int, points: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        located, sign = ops.place(points, placement)
+        own = coefficients.values.view_as(coefficients.values)  # derivatives of one call are summed on their own
+        return self.jet(replace(coefficients, values=own), located, order), sign
 
 
 @dataclass(frozen=True)
-class EightTrilinearQuadratic:
+class EightTrilinearQuadratic(Sampled):
     """Triquadratic value and gradient from the same eight trilinear samples (paper, eqs. 7, 24, 25).
 
     With β = x − ⌊x + ½⌋ per axis: samples at x − δ₀ and x + δ₁, δ₀ = ¼ + β/2, δ₁ = ¼ − β/2, weighted by g₀ = ½ − β and
@@ -171,7 +193,7 @@ class EightTrilinearQuadratic:
 
 
 @dataclass(frozen=True)
-class EightTrilinearCubic:
+class EightTrilinearCubic(Sampled):
     """Tricubic B-spline value from 8 trilinear samples, each partial derivative from 8 more (paper, eqs. 1-3).
 
     Per axis, with α the fractional part and w_t the four weights (or their derivatives): samples at
@@ -228,7 +250,7 @@ def _combine(samples: list[Tensor], weights: list[Tensor]) -> Tensor:
 
 
 @dataclass(frozen=True)
-class TrilinearCentral:
+class TrilinearCentral(Sampled):
     """One trilinear sample for the value, six more for central differences: what volume renderers do by default."""
 
     sample: Sampler

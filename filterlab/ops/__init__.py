@@ -1,8 +1,12 @@
-"""The numerical core: `gather` and its adjoint `scatter`. Every evaluation in filterlab goes through these two.
+"""The numerical core: fused operations, their adjoints, and what they are checked against.
 
-`stencil` says what is summed; `gather` and `scatter` here choose what computes it: `reference` is plain torch, `cpu`
-fused vector code, `cuda` fused code for a GPU; `autograd` makes the pair differentiable, whichever it is. `jet` and
-`splat` are the pair for all partial derivatives of one tensor-product kernel.
+    stencil ──▶ gather  place  prefilter  march ──▶ reference ──▶ cpu, cuda ──▶ differentiable ──▶ here
+    what is summed    descriptions of every op     plain twins    programs     choice, adjoint
+
+Every op has the same five parts in the same places: what it is (`<op>`: frozen data, shapes, limits), the plain twin
+(`reference`), vector code (`cpu`), code for a GPU (`cuda`), and what makes it differentiable and chooses
+(`differentiable`). `gather` and its adjoint `scatter` are what every evaluation goes through; `jet` and `splat` are the
+pair for all partial derivatives of one tensor-product kernel.
 """
 
 from __future__ import annotations
@@ -13,13 +17,18 @@ import torch
 from torch import Tensor
 
 from filterlab.kernels import PiecewisePolynomial
-from filterlab.ops import autograd, compiled, placement
-from filterlab.ops.autograd import IMPLEMENTATIONS
-from filterlab.ops.placement import Placed, Placement
+from filterlab.ops.differentiable import gather as sums
+from filterlab.ops.differentiable import operators
+from filterlab.ops.differentiable import place as placement
+from filterlab.ops.differentiable.evaluation import Evaluation
+from filterlab.ops.differentiable.gather import IMPLEMENTATIONS
+from filterlab.ops.differentiable.prefilter import prefilter_axis, prefilter_samples
+from filterlab.ops.place import Placed, Placement
 from filterlab.ops.stencil import Product, Stencil, multi_indices
 
 __all__ = [
     "IMPLEMENTATIONS",
+    "Evaluation",
     "Placement",
     "Product",
     "Stencil",
@@ -27,6 +36,8 @@ __all__ = [
     "jet",
     "multi_indices",
     "place",
+    "prefilter_axis",
+    "prefilter_samples",
     "scatter",
     "splat",
 ]
@@ -45,7 +56,7 @@ def _check(batch: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int]
 def _check_implementation(name: str, values: Tensor, points: Tensor, stencil: Stencil, *sizes) -> None:
     if name not in IMPLEMENTATIONS:
         raise ValueError(f"implementation must be one of {', '.join(IMPLEMENTATIONS)}; got {name!r}")
-    if name in autograd.MISSING and (why := autograd.MISSING[name](values, points, stencil, *sizes)):
+    if why := sums.missing(name, values, points, stencil, *sizes):
         raise ValueError(f"implementation {name!r} can't run here: {why}; implementation='reference' can")
 
 
@@ -73,12 +84,12 @@ def gather(
         ValueError: wrong shapes; an unknown implementation, or one that can't run as asked (the message says why).
     """
     if torch.compiler.is_compiling():
-        return compiled.gather(coefficients, points, compiled.stencil_text(stencil), start, implementation)
+        return operators.gather(coefficients, points, operators.stencil_text(stencil), start, implementation)
     if coefficients.ndim != 5:
         raise ValueError(f"coefficients must have shape (N, C, D, H, W); got {tuple(coefficients.shape)}")
     _check(coefficients, points, stencil, coefficients.shape[2:])
     _check_implementation(implementation, coefficients, points, stencil, None, start)
-    return autograd.gather(coefficients, points, stencil, start, implementation)
+    return sums.gather(coefficients, points, stencil, start, implementation)
 
 
 def scatter(
@@ -101,13 +112,13 @@ def scatter(
         of times in cotangents and points.
     """
     if torch.compiler.is_compiling():
-        return compiled.scatter(cotangents, points, compiled.stencil_text(stencil), shape, start, implementation)
+        return operators.scatter(cotangents, points, operators.stencil_text(stencil), shape, start, implementation)
     rows = len(stencil.rows)
     if cotangents.ndim != 4 or cotangents.shape[2:] != (rows, points.shape[1]):
         raise ValueError(f"cotangents must have shape (N, C, {rows}, M); got {tuple(cotangents.shape)}")
     _check(cotangents, points, stencil, shape)
     _check_implementation(implementation, cotangents, points, stencil, shape, start)
-    return autograd.scatter(cotangents, points, stencil, tuple(shape), start, implementation)
+    return sums.scatter(cotangents, points, stencil, tuple(shape), start, implementation)
 
 
 def place(points: Tensor, where: Placement, implementation: str = "reference") -> Placed:
@@ -122,7 +133,7 @@ def place(points: Tensor, where: Placement, implementation: str = "reference") -
         Differentiable in the points, any number of times: d located_i / d point_j = sign_i · matrix_ij.
     """
     if torch.compiler.is_compiling():
-        return compiled.place(points, compiled.placement_text(where), implementation)
+        return operators.place(points, operators.placement_text(where), implementation)
     return placement.place(points, where, implementation)
 
 

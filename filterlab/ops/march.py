@@ -1,36 +1,23 @@
-"""The fused march: rays through coefficients, a transfer function and lights, to light and optical depth.
+"""The march, described: rays through coefficients, a transfer function and lights, to light and optical depth.
 
 Everything is prepared by the caller as plain tensors: rays cut to the volume, in coordinates of the coefficients; the
-tables of the transfer function; lights and halfway vectors of every ray. `ops.cpu.march` is the program, on a GPU
-`ops.cuda.march` and `ops.cuda.adjoint`. No derivatives are recorded here: `March.adjoint` computes them from what
-`March.run` gave.
-
-Memory beyond the result: 48 bytes per interval of the transfer function and 32 per bucket (at most 4096) in float32;
-for the adjoint 8 · (9 + 12 K) bytes per ray, K lights, and for derivatives by the coefficients one volume of them per
-thread (within `SPLAT_MEMORY`); on a GPU one volume, and 6 KiB per interval of the transfer function.
+tables of the transfer function; lights and halfway vectors of every ray. `ops.reference.march` says what is computed,
+`ops.cpu.march` and `ops.cuda.march` are the programs, `ops.march_derivatives` how their adjoints lay derivatives out.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from filterlab.ops import cpu, cuda
-from filterlab.ops.derivatives import GRADIENTS, TABLE_ROW, by_name, columns_of_rays
-from filterlab.ops.fused import STORAGE
 from filterlab.ops.stencil import Stencil
 
-if TYPE_CHECKING:
-    from filterlab.ops.cpu.march import Job
-
 MAX_LIGHTS = 8
-RAYS_AT_ONCE = 1 << 13  # then progress is reported, and Ctrl-C heard
 
 _FEWEST_BUCKETED = 16  # inner control points; fewer are compared one by one
 _MOST_BUCKETS = 1 << 12
@@ -39,13 +26,14 @@ _SLACK = {torch.float32: 2.0**-21, torch.float64: 2.0**-50}  # rounding of a poi
 
 
 @dataclass(frozen=True)
-class Rays:
-    """R rays inside the volume: points entry + t direction, 0 ≤ t ≤ length.
+class Chords:
+    """The parts of R rays that lie in a volume: points entry + t direction, 0 ≤ t ≤ length.
 
     Attributes:
-        entry, direction: (R, 3) float64, in coordinates of the coefficients; the direction per world length.
-        length: (R,) float64, world lengths.
-        offset: (R,) float64: how far into a step the first segment reaches.
+        entry, direction: (R, 3) float64; in the world with unit directions, or, for a `March`, in coordinates of the
+            coefficients and the direction per world length.
+        length: (R,) float64, world lengths; 0 for a ray that misses.
+        offset: (R,) float64: how far into a step the first segment reaches, in (0, 1].
         count: (R,) int64, segments.
     """
 
@@ -54,6 +42,10 @@ class Rays:
     length: Tensor
     offset: Tensor
     count: Tensor
+
+    def at(self, rays: Tensor) -> Chords:
+        """Those of some of the rays."""
+        return Chords(*(x[rays] for x in (self.entry, self.direction, self.length, self.offset, self.count)))
 
 
 @dataclass(frozen=True)
@@ -111,6 +103,10 @@ class Lighting:
     def lights(self) -> int:
         return self.diffuse.shape[0]
 
+    def at(self, rays: Tensor) -> Lighting:
+        """As seen along some of the rays."""
+        return replace(self, toward=self.toward[rays], halfway=self.halfway[rays])
+
 
 @dataclass(frozen=True)
 class Bricks:
@@ -125,37 +121,15 @@ class Bricks:
     edge: int
 
 
-def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dtype, lights: int) -> str | None:
-    """What keeps the march from running here as asked; None: nothing does.
-
-    Args:
-        coefficients: (D, H, W).
-        stencil: value, and gradient when lit.
-        start: the coordinate of coefficient 0.
-        dtype: of the samples.
-        lights: K.
-    """
-    if lights > MAX_LIGHTS:
-        return f"up to {MAX_LIGHTS} lights; got {lights}"
-    points = torch.empty(1, 0, 3, dtype=dtype, device=coefficients.device)
-    implementation = cuda if on_gpu(coefficients) else cpu
-    return implementation.missing(coefficients.detach()[None, None], points, stencil, None, start)
-
-
-def on_gpu(tensor: Tensor) -> bool:
-    """Whether rays through these coefficients are marched by the Triton programs."""
-    return tensor.device.type == "cuda"
-
-
 @dataclass(frozen=True)
 class March:
-    """A march and its adjoint. Tensors are in one dtype, float32 or float64, but for the rays (float64).
+    """A march: what rays go through. Tensors are in one dtype, float32 or float64, but for the rays (float64).
 
     Attributes:
-        coefficients: (D, H, W), of any dtype that `ops.cpu` reads.
+        coefficients: (D, H, W), of any dtype of `ops.gather.STORAGE`.
         start: the coordinate of coefficient 0.
         stencil: its rows are the value, and with lights the gradient.
-        rays, transfer, lighting: see there; lighting None: unlit.
+        chords, transfer, lighting: see there; lighting None: unlit.
         step: world length of a segment.
         faint: transmittance below which a ray ends; 0: where nothing passes any more.
         bricks: which parts of the volume are empty; None: not known.
@@ -164,17 +138,21 @@ class March:
     coefficients: Tensor
     start: int
     stencil: Stencil
-    rays: Rays
+    chords: Chords
     transfer: Transfer
     lighting: Lighting | None
     step: float
     faint: float = 0.0
     bricks: Bricks | None = None
-    _kept: list[object] = field(default_factory=list, repr=False)  # what jobs point to
 
     @property
     def dtype(self) -> torch.dtype:
         return self.transfer.positions.dtype
+
+    @property
+    def lights(self) -> int | None:
+        """K; None: unlit."""
+        return None if self.lighting is None else self.lighting.lights
 
     @property
     def opaque(self) -> float:
@@ -186,197 +164,29 @@ class March:
         """By how much a point may be rounded, in voxels."""
         return _SLACK[self.dtype] * (abs(self.start) + max(self.coefficients.shape))
 
-    @cached_property
-    def _readable(self) -> Tensor:
-        """The coefficients as they are read."""
-        return self.coefficients.detach().resolve_neg().contiguous()
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """Every tensor by its name here or in the parts."""
+        parts = (part for part in (self.chords, self.transfer, self.lighting) if part is not None)
+        named = {f.name: getattr(part, f.name) for part in parts for f in fields(part)}
+        return {"coefficients": self.coefficients} | {k: v for k, v in named.items() if isinstance(v, Tensor)}
 
-    @torch.no_grad()
-    def run(self, report: Callable[[int], None] = lambda rays: None) -> tuple[Tensor, Tensor]:
-        """Light (R, 3) and optical depth (R,), float64. `report` is given the number of rays done, now and then."""
-        if on_gpu(self.coefficients):
-            from filterlab.ops.cuda import march
+    @property
+    def inputs(self) -> dict[str, Tensor]:
+        """What every program reads: rays as they are, tables of the transfer function and of the lights, bricks."""
+        bricks = {} if self.bricks is None else {"bricks": self.bricks.distance}
+        lit = {} if self.lighting is None else _lit(self.lighting)
+        return vars(self.chords) | _tables(self.transfer) | lit | bricks
 
-            return march.run(self, report)
-        rays = self.rays.count.shape[0]
-        light = torch.zeros(rays, 3, dtype=torch.float64)
-        depth = torch.zeros(rays, dtype=torch.float64)
-        if rays:
-            job = self._job((), light=light, depth=depth)
-            self._launch((), job, report)
-        return light, depth
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> March:
+        """The same with other tensors in place of those of `tensors`."""
 
-    @torch.no_grad()
-    def adjoint(
-        self,
-        light: Tensor,
-        light_cotangent: Tensor,
-        depth_cotangent: Tensor,
-        wanted: Collection[str],
-        report: Callable[[int], None] = lambda rays: None,
-    ) -> dict[str, Tensor]:
-        """Derivatives of Σ light · its cotangent + Σ depth · its cotangent.
+        def changed(part):
+            return None if part is None else replace(part, **{k: v for k, v in tensors.items() if hasattr(part, k)})
 
-        Args:
-            light: what `run` gave, (R, 3).
-            light_cotangent, depth_cotangent: (R, 3) and (R,), float64.
-            wanted: some of "coefficients", "rays", "table", "shading".
-            report: as for `run`.
-
-        Returns:
-            by name, in the shapes of what they belong to: for "coefficients" coefficients; for "rays" entry, direction,
-            length; for "table" positions, colors, opacities; for "shading" ambient, shininess, diffuse, specular,
-            toward, halfway. Float64 but for the coefficients' (the dtype of the march).
-
-        On the CPU the same bits for one number of threads: every thread has rays of its own and adds into partial
-        results of its own, which are summed in order. Those by rays and shading do not depend on the threads at all. On
-        a GPU those by coefficients and table are added atomically, and repeat themselves up to rounding only.
-        """
-        gradients = tuple(name for name in GRADIENTS if name in wanted)
-        arrays = {"light": light, "light_cotangent": light_cotangent, "depth_cotangent": depth_cotangent}
-        if on_gpu(self.coefficients):
-            from filterlab.ops.cuda import adjoint
-
-            return adjoint.run(self, gradients, arrays, report)
-        from filterlab.ops.cpu.march import TABLES
-
-        lights = self.lighting.lights if self.lighting else None
-        rays, intervals = self.rays.count.shape[0], max(len(self.transfer.positions) - 1, 1)
-        threads = self._threads_of_adjoint("coefficients" in gradients)
-        by_ray = torch.zeros(rays, columns_of_rays(lights), dtype=torch.float64)
-        tables = torch.zeros(threads, TABLES, intervals, TABLE_ROW, dtype=torch.float64)
-        volumes = []
-        if "coefficients" in gradients:
-            volumes = [cpu._zeros((1, *self.coefficients.shape), self.dtype)[0] for _ in range(threads)]
-        if rays:
-            job = self._job(gradients, ray_gradient=by_ray, **arrays)
-            own = [_copy(job) for _ in range(threads)]
-            for i, one in enumerate(own):
-                one.table_gradient = tables[i].data_ptr()
-                one.coefficient_gradient = volumes[i].data_ptr() if volumes else None
-            self._launch_parts(gradients, own, report)
-        for part in volumes[1:]:
-            volumes[0] += part
-        volume = volumes[0] if volumes else None
-        return by_name(gradients, volume, by_ray, tables.sum((0, 1)), len(self.transfer.positions), lights)
-
-    def _threads_of_adjoint(self, with_volumes: bool) -> int:
-        """One for every so many rays, and no more volumes of derivatives than memory allows."""
-        from filterlab.ops.cpu.traversal import RAYS_OF_A_BLOCK
-
-        threads = max(1, min(torch.get_num_threads(), self.rays.count.shape[0] // RAYS_OF_A_BLOCK))
-        if with_volumes:
-            threads = min(threads, 1 + cpu.SPLAT_MEMORY // (self.coefficients.numel() * self.dtype.itemsize))
-        return threads
-
-    # --- jobs ---
-
-    def _job(self, gradients: tuple[str, ...], **arrays: Tensor) -> Job:
-        from filterlab.ops.cpu import march
-
-        d, h, w = self.coefficients.shape
-        job = march.Job(
-            width=w,
-            height=h,
-            start=self.start,
-            step=self.step,
-            per_unit=1 / self.transfer.unit,
-            faint=self.faint,
-            opaque=self.opaque,
-        )
-        for axis, size, support in zip(march.AXES, (w, h, d), self.stencil.supports, strict=True):
-            setattr(job, f"low_{axis}", self.start)
-            setattr(job, f"high_{axis}", self.start + size - support)
-        job.intervals = max(len(self.transfer.positions) - 1, 1)
-        inputs = {
-            "coefficients": self._readable,
-            **{name: getattr(self.rays, name) for name in ("entry", "direction", "length", "offset", "count")},
-            **_tables(self.transfer),
-            **(self._lit() if self.lighting else {}),
-            **arrays,
-        }
-        if (steps := self.transfer.steps) is not None:
-            job.steps_low, job.steps_scale, job.steps_last = steps.low, steps.scale, steps.count - 1
-            if steps.buckets is not None:
-                inputs["buckets"] = steps.buckets
-        if self.bricks is not None:
-            inputs["bricks"] = self.bricks.distance
-            job.edge = self.bricks.edge
-            job.slack = self.slack
-            for axis, count in zip(march.AXES, self.bricks.distance.shape[::-1], strict=True):
-                setattr(job, f"bricks_{axis}", count)
-        for name, tensor in inputs.items():
-            tensor = tensor.detach().resolve_neg().contiguous()
-            self._kept.append(tensor)
-            setattr(job, name, tensor.data_ptr())
-        return job
-
-    def _lit(self) -> dict[str, Tensor]:
-        s = self.lighting
-        assert s is not None
-        numbers = torch.stack((s.ambient, s.shininess))
-        tints = torch.stack((s.diffuse, s.specular), 1).reshape(-1)
-        view = torch.stack((s.toward, s.halfway), 2)
-        return {"shading": torch.cat((numbers, tints)), "view": view, "world": s.world}
-
-    def _launch(self, gradients: tuple[str, ...], job: Job, report: Callable[[int], None]) -> None:
-        """Let the threads loose on one portion of the rays after the other."""
-        from filterlab.ops.cpu import compiler
-        from filterlab.ops.cpu import threads as pool
-        from filterlab.ops.cpu.traversal import RAYS_OF_A_BLOCK
-
-        function = compiler.compiled(self._recipe(gradients))
-        rays = self.rays.count.shape[0]
-        for first in range(0, rays, RAYS_AT_ONCE):
-            job.first, job.last = first, min(first + RAYS_AT_ONCE, rays)
-            job.stride = job.chunks = -(-(job.last - first) // RAYS_OF_A_BLOCK)
-            job.next = 0
-            pool.run(function, [job] * max(1, min(torch.get_num_threads(), job.chunks)))
-            report(job.last)
-
-    def _launch_parts(self, gradients: tuple[str, ...], jobs: list[Job], report: Callable[[int], None]) -> None:
-        """The same with a job for every thread: thread i takes blocks i, i + threads, … of the rays."""
-        from filterlab.ops.cpu import compiler
-        from filterlab.ops.cpu import threads as pool
-
-        function = compiler.compiled(self._recipe(gradients))
-        rays = self.rays.count.shape[0]
-        for first in range(0, rays, RAYS_AT_ONCE):
-            for i, job in enumerate(jobs):
-                job.first, job.last = first, min(first + RAYS_AT_ONCE, rays)
-                job.next, job.chunks, job.stride = i, i + 1, len(jobs)
-            pool.run(function, jobs)
-            report(min(first + RAYS_AT_ONCE, rays))
-
-    def _recipe(self, gradients: tuple[str, ...]):
-        from filterlab.ops.cpu import compiler
-        from filterlab.ops.cpu.march import Recipe
-
-        raised = self.stencil.derivatives if "rays" in gradients else None
-        return Recipe(
-            gradients,
-            self.stencil.lowered,
-            None if raised is None else (raised[0].lowered, raised[1]),
-            self.lighting is not None,
-            self.lighting.lights if self.lighting else 0,
-            self.bricks is not None,
-            _way_to_intervals(self.transfer.steps),
-            cpu._ARITHMETIC[self.dtype],
-            STORAGE[self.coefficients.dtype],
-            cpu.has_room(self._readable),
-            cpu._lanes(compiler.features(), self.dtype.itemsize),
-        )
-
-
-def _copy(job: Job) -> Job:
-    return type(job).from_buffer_copy(job)
-
-
-def _way_to_intervals(steps: Steps | None) -> str:
-    """One of `ops.cpu.optics.WAYS`."""
-    if steps is None:
-        return "compared"
-    return "even" if steps.buckets is None else "bucketed"
+        coefficients = tensors.get("coefficients", self.coefficients)
+        parts = {"chords": changed(self.chords), "transfer": changed(self.transfer), "lighting": changed(self.lighting)}
+        return replace(self, coefficients=coefficients, **parts)
 
 
 def _equal_steps(x: Tensor) -> Steps | None:
@@ -426,3 +236,11 @@ def _tables(transfer: Transfer) -> dict[str, Tensor]:
         "opacities": torch.stack((x[:-1], x[1:], alpha[:-1], alpha[1:]), -1),
         "colors": torch.cat((colors, torch.stack((alpha[:-1], alpha[1:]), -1)), -1),
     }
+
+
+def _lit(s: Lighting) -> dict[str, Tensor]:
+    """Lights as the programs read them."""
+    numbers = torch.stack((s.ambient, s.shininess))
+    tints = torch.stack((s.diffuse, s.specular), 1).reshape(-1)
+    view = torch.stack((s.toward, s.halfway), 2)
+    return {"shading": torch.cat((numbers, tints)), "view": view, "world": s.world}

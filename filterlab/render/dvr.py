@@ -24,13 +24,16 @@ from torch.utils.checkpoint import checkpoint
 
 from filterlab.fields.base import Domain, Field
 from filterlab.fields.grid import GridField
+from filterlab.ops.march import Chords
+from filterlab.ops.reference.march import rays_at_once
+from filterlab.ops.reference.optics import absorbed
 from filterlab.render.camera import Camera, check_size
 from filterlab.render.fused import FusedMarcher, why_not_fused
-from filterlab.render.plain import Chords, Marcher, Medium, PlainMarcher, rays_at_once
+from filterlab.render.plain import Marcher, Medium, PlainMarcher
 from filterlab.render.rays import Region, check_rays, check_region, intersect, jitter, segment_count
 from filterlab.render.shading import Shading
 from filterlab.render.tiles import tiled
-from filterlab.render.transfer import TransferFunction, absorbed
+from filterlab.render.transfer import TransferFunction
 
 Rays = tuple[Tensor, Tensor]
 Progress = bool | None | Callable[[int, int], None]

@@ -16,10 +16,11 @@ import torch
 from filterlab.costs import Quartiles, coefficient_bytes
 from filterlab.fields.grid import GridField
 from filterlab.methods import METHODS
+from filterlab.ops.march import Chords
+from filterlab.ops.reference.march import segments
 from filterlab.render.dvr import Job, prepare
 from filterlab.render.fused import FusedMarcher, empty_bricks, why_not_fused
-from filterlab.render.plain import Chords, Medium
-from filterlab.render.rays import segments
+from filterlab.render.plain import Medium
 from filterlab.render.scene import Prepared, Scene
 
 _PROBE_RAYS = 4096

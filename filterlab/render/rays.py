@@ -112,23 +112,6 @@ def segment_count(length: Tensor, step: float, offset: Tensor | float = 1.0) -> 
     return torch.where(length.detach() > 0, count, torch.zeros_like(count))
 
 
-def segments(
-    length: Tensor, step: float, first: int, number: int, offset: Tensor | float = 1.0
-) -> tuple[Tensor, Tensor]:
-    """Midpoints and lengths of `number` segments from the `first` on, `(R, number)` each, for rays of `length` `(R,)`.
-
-    Segment i is [(i − 1 + offset) step, (i + offset) step] cut to [0, length]: with offset = 1 every segment is a step
-    long and only the last is shorter; with an offset in (0, 1] the first one is shorter as well. The lengths of a ray's
-    segments always sum to its length. Beyond the end the length is 0. Differentiable in `length`.
-    """
-    i = torch.arange(first, first + number, dtype=length.dtype, device=length.device)
-    if isinstance(offset, Tensor):
-        offset = offset[:, None]
-    end = torch.minimum((i + offset) * step, length[:, None])
-    start = torch.minimum(((i - 1 + offset) * step).clamp_min(0), length[:, None])
-    return (start + end) / 2, end - start
-
-
 _MASK = 0xFFFFFFFF
 
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from filterlab.ops.reference.optics import dot, power, safe_normalize
+
 
 @dataclass(frozen=True)
 class Light:
@@ -104,39 +106,14 @@ class Shading:
         for light in self.lights:
             tint = _like(light.color, view)
             if light.direction is None:
-                facing = half = _dot(normal, view).abs()
+                facing = half = dot(normal, view).abs()
             else:
                 to_light = safe_normalize(_like(light.direction, view))
-                facing = _dot(normal, to_light).abs()
-                half = _dot(normal, safe_normalize(to_light + view)).abs()
+                facing = dot(normal, to_light).abs()
+                half = dot(normal, safe_normalize(to_light + view)).abs()
             matt = matt + tint * facing[..., None]
-            shine = shine + tint * _power(half, shininess)[..., None]
+            shine = shine + tint * power(half, shininess)[..., None]
         return matt, shine
-
-
-def safe_normalize(vector: Tensor) -> Tensor:
-    """vector / |vector| along the last axis, and 0 (with derivative 0) for the zero vector.
-
-    Vectors are first divided by their largest component, held constant: the result does not depend on the scale, so its
-    derivatives of every order are unchanged, while neither tiny nor huge vectors under- or overflow.
-    """
-    largest = vector.detach().abs().amax(-1, keepdim=True)
-    zero = largest == 0
-    scaled = vector / torch.where(zero, torch.ones_like(largest), largest)
-    scaled = torch.where(zero, torch.zeros_like(scaled), scaled)
-    squared = _dot(scaled, scaled)[..., None]
-    return scaled / torch.where(zero, torch.ones_like(squared), squared).sqrt()
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Σ_d a_d b_d in the order x, y, z, whatever the number of vectors: a reduction might regroup."""
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
-
-
-def _power(base: Tensor, exponent: Tensor) -> Tensor:
-    """base^exponent for base ≥ 0, and 0 with derivative 0 at base = 0 (where 1 < exponent < 2 has no second one)."""
-    positive = base != 0
-    return torch.where(positive, torch.where(positive, base, torch.ones_like(base)) ** exponent, torch.zeros_like(base))
 
 
 def _plain(value: float | Tensor) -> float:

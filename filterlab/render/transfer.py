@@ -6,10 +6,12 @@ Letters: v a field's value; x_j the control points; α opacity; s a world length
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import Self
 
 import torch
 from torch import Tensor
+
+from filterlab.ops.reference.optics import Table
 
 Numbers = Sequence[float] | Tensor
 Peak = tuple[float | Tensor, float | Tensor, float | Tensor, Numbers]
@@ -19,18 +21,7 @@ Peak = tuple[float | Tensor, float | Tensor, float | Tensor, Numbers]
 _FOOT = 1e-12
 
 
-class Located(NamedTuple):
-    """Where values fall between control points: interval `(...)` (integer) and fraction `(...)` in 0 … 1."""
-
-    interval: Tensor
-    fraction: Tensor
-
-    def at(self, index: Tensor) -> Located:
-        """Those of some of the values `(S,)`."""
-        return Located(self.interval.index_select(0, index), self.fraction.index_select(0, index))
-
-
-class TransferFunction:
+class TransferFunction(Table):
     """Piecewise linear in the scalar: colour and opacity are interpolated between control points.
 
     α(v) = (1−w) α_j + w α_{j+1}, w = (v − x_j)/(x_{j+1} − x_j), likewise linear RGB; constant beyond both ends, and
@@ -51,10 +42,8 @@ class TransferFunction:
     """
 
     def __init__(self, positions: Numbers, colors: Sequence[Numbers] | Tensor, opacities: Numbers, unit: float = 1.0):
-        self.positions = _table("positions", positions)
-        self.colors = _table("colors", colors)
-        self.opacities = _table("opacities", opacities)
-        self.unit = float(unit)
+        tables = _table("positions", positions), _table("colors", colors), _table("opacities", opacities)
+        super().__init__(*tables, float(unit))
         _check_tables(self)
 
     @classmethod
@@ -94,16 +83,6 @@ class TransferFunction:
         return any(t.requires_grad for t in (self.positions, self.colors, self.opacities))
 
     @property
-    def transparent_somewhere(self) -> bool:
-        """True when some value has opacity 0."""
-        return bool((self.opacities == 0).any())
-
-    @property
-    def opaque_somewhere(self) -> bool:
-        """True when some value has opacity 1."""
-        return bool((self.opacities >= 1).any())
-
-    @property
     def brightest(self) -> float:
         """The largest colour component."""
         return float(self.colors.detach().max())
@@ -119,55 +98,12 @@ class TransferFunction:
         _check_tables(out)  # again: an optimizer may have moved them since
         return out
 
-    def locate(self, value: Tensor) -> Located:
-        """Between which control points the values `(...)` lie; the one search that opacity and colour share."""
-        x = self.positions
-        if len(x) == 1:
-            return Located(torch.zeros_like(value, dtype=torch.int32), torch.zeros_like(value) * value)
-        interval = torch.searchsorted(x[1:-1].detach().contiguous(), value.detach(), right=True, out_int32=True)
-        fraction = (value - _take(x[:-1], interval)) / _take(x.diff(), interval)
-        return Located(interval, fraction.clamp(0, 1))
-
-    def opacity(self, located: Located) -> Tensor:
-        """Opacities per unit, `(...)`."""
-        return self._interpolate(self.opacities, located.interval, located.fraction)
-
-    def color(self, located: Located) -> Tensor:
-        """Linear RGB, `(..., 3)`."""
-        return self._interpolate(self.colors, located.interval, located.fraction[..., None])
-
-    def optical_depth(self, opacity: Tensor, length: Tensor) -> Tensor:
-        """τ = −log1p(−α) · length / unit, `(...)`; ∞ for α = 1 over any length > 0, with derivative 0 there."""
-        length = length / self.unit
-        if not self.opaque_somewhere:
-            return -torch.log1p(-opacity) * length
-        opaque = opacity >= 1
-        depth = -torch.log1p(-torch.where(opaque, torch.zeros_like(opacity), opacity)) * length
-        return torch.where(opaque & (length > 0), torch.full_like(depth, torch.inf), depth)
-
     def __call__(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """(linear RGB `(..., 3)`, opacity per unit `(...)`) of values `(...)`, in promote(value, float32)."""
         value = value.to(torch.promote_types(value.dtype, torch.float32))
         function = self.to(value.dtype, value.device)
         located = function.locate(value)
         return function.color(located), function.opacity(located)
-
-    def _interpolate(self, table: Tensor, interval: Tensor, fraction: Tensor) -> Tensor:
-        if len(table) == 1:
-            return _take(table, interval) + 0 * fraction
-        return torch.lerp(_take(table[:-1], interval), _take(table[1:], interval), fraction)  # exact at both ends
-
-
-def absorbed(depth: Tensor) -> Tensor:
-    """1 − e^{−τ}, the opacity of optical depths τ ≥ 0, `(...)`; derivatives too keep their digits at both ends.
-
-    torch takes the derivative of expm1 as its value plus 1, of which nothing is left where the value is near −1.
-    """
-    return torch.where(depth > 1, 1 - torch.exp(-depth), -torch.expm1(-depth))
-
-
-def _take(table: Tensor, interval: Tensor) -> Tensor:
-    return table.index_select(0, interval.reshape(-1)).reshape(interval.shape + table.shape[1:])
 
 
 def _scalar(value: Numbers | float) -> Tensor:

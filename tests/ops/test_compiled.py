@@ -11,7 +11,8 @@ from filterlab import ops
 from filterlab.fields.ncrsi import NCRSI_TERMS
 from filterlab.fields.tensor_product import Direct
 from filterlab.kernels import bspline
-from filterlab.ops import Placement, Stencil, compiled
+from filterlab.ops import Placement, Stencil
+from filterlab.ops.differentiable import operators as compiled
 from filterlab.volume import Boundary, Geometry
 from tests.laws import assert_close
 

@@ -12,7 +12,11 @@ from filterlab import ops
 from filterlab.fields.ncrsi import NCRSI_TERMS
 from filterlab.fields.tensor_product import Direct, same_kernel
 from filterlab.kernels import CATMULL_ROM, CENTRAL_DIFFERENCE, KERNELS, LINEAR, TensorKernel, bspline
-from filterlab.ops import Product, Stencil, autograd, cpu, reference
+from filterlab.ops import Product, Stencil, cpu
+from filterlab.ops.cpu import gather as fused
+from filterlab.ops.differentiable.gather import gradient_to_points
+from filterlab.ops.gather import MAX_ORDER
+from filterlab.ops.reference import gather as reference
 from tests.laws import assert_close
 
 SHAPE = (9, 8, 7)
@@ -91,7 +95,7 @@ SUMS = {
 def test_sums_of_products(name: str, dtype: torch.dtype) -> None:
     stencil = SUMS[name]
     for s in (stencil, stencil.derivatives[0]):
-        if s.order > cpu.MAX_ORDER:
+        if s.order > MAX_ORDER:
             continue
         points, coefficients = some_points(2, 45, dtype), torch.randn((2, 2, *SHAPE), dtype=dtype)
         expected = ops.gather(coefficients, points, s, START)
@@ -200,17 +204,17 @@ def test_nan_and_infinite_points_give_nan_and_leave_their_neighbours_alone(name:
 @pytest.mark.parametrize("m", [16, 17, 45])  # sorting needs a pack of points: 16 floats with AVX-512
 @pytest.mark.parametrize("name", ["quadratic", "ncrsi, central", "trilinear, central"])
 def test_pull_is_the_adjoint_to_the_points(name: str, m: int, sorting: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cpu, "_sorting_pays", lambda *_: sorting)
+    monkeypatch.setattr(fused, "_sorting_pays", lambda *_: sorting)
     stencil = SUMS.get(name) or Stencil.jet(bspline(2), 1)
     for dtype in (torch.float32, torch.float64):
-        if stencil.order >= cpu.MAX_ORDER:
+        if stencil.order >= MAX_ORDER:
             continue
         coefficients, points = torch.randn(2, 3, *SHAPE, dtype=dtype), some_points(2, m, dtype)
         cotangents = torch.randn(2, 3, len(stencil.rows), m, dtype=dtype)
         raised = ops.gather(coefficients, points, stencil.derivatives[0], START)
-        expected = autograd.gradient_to_points(raised, cotangents, stencil)
-        assert_same(cpu.pull(coefficients, points, cotangents, stencil, START), expected)
-    assert cpu.pull(coefficients, points[:, :0], cotangents[..., :0], stencil, START).shape == (2, 0, 3)
+        expected = gradient_to_points(raised, cotangents, stencil)
+        assert_same(fused.pull(coefficients, points, cotangents, stencil, START), expected)
+    assert fused.pull(coefficients, points[:, :0], cotangents[..., :0], stencil, START).shape == (2, 0, 3)
 
 
 @pytest.mark.parametrize("implementation", ["reference", "cpu"])
@@ -357,12 +361,14 @@ def test_splat_keeps_to_its_memory(threads, monkeypatch: pytest.MonkeyPatch) -> 
     points, cotangents = some_points(1, 100_000, torch.float32), torch.randn(1, 1, 1, 100_000)
     volume = 4 * 9 * 8 * 7
     for limit, parts in ((0, 1), (volume, 2), (3 * volume + 5, 4), (1 << 30, 8)):
-        monkeypatch.setattr(cpu, "SPLAT_MEMORY", limit)
+        monkeypatch.setattr(fused, "SPLAT_MEMORY", limit)
         asked = []
-        run = cpu._run
-        monkeypatch.setattr(cpu, "_run", lambda *a, run=run, asked=asked, **k: (asked.append(len(a[1])), run(*a, **k)))
+        run = fused.Program.divide
+        monkeypatch.setattr(
+            fused.Program, "divide", lambda *a, run=run, asked=asked: (asked.append(len(a[1])), run(*a))
+        )
         ops.splat(cotangents, points, bspline(2), 0, SHAPE, START, "cpu")
-        monkeypatch.setattr(cpu, "_run", run)
+        monkeypatch.setattr(fused.Program, "divide", run)
         assert asked == [parts]
 
 
@@ -399,6 +405,6 @@ def test_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
         ops.splat(torch.zeros(1, 1, 1, 4), p, seven, 0, SHAPE, implementation="cpu")
     with pytest.raises(ValueError, match="implementation must be one of reference, cpu, cuda; got 'gpu'"):
         ops.jet(c, p, k, implementation="gpu")
-    monkeypatch.setattr(cpu, "_llvmlite_problem", lambda: "the package llvmlite can't be loaded")
+    monkeypatch.setattr(cpu, "llvmlite_problem", lambda: "the package llvmlite can't be loaded")
     with pytest.raises(ValueError, match="llvmlite"):
         ops.jet(c, p, k, implementation="cpu")

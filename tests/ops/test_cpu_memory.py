@@ -40,7 +40,9 @@ POINTS = r"""
 from filterlab.fields.ncrsi import NCRSI_TERMS
 from filterlab.fields.tensor_product import Direct
 from filterlab.kernels import CATMULL_ROM, LINEAR, bspline
-from filterlab.ops import Stencil, cpu, gather
+from filterlab.ops import Stencil, gather
+from filterlab.ops.cpu.gather import Program
+from filterlab.ops.gather import MAX_ORDER
 
 wild = torch.tensor([0.0, -0.0, 1e30, -1e30, float("inf"), -float("inf"), float("nan"), 3e9, -3e9, 1e10, 2**31, -2**31,
                      2**24, 6.5, 1e-45])
@@ -60,25 +62,31 @@ for stencil, (dtype, stored) in cases:
             points = guarded(points, at_end)
             coefficients = guarded((torch.rand(2, 2, *shape) * 100).to(stored), at_end)
             rows = guarded(torch.full((2, 2, 4, m), 7, dtype=dtype), at_end)
-            cpu._run("gather", [coefficients], points, rows, stencil, 0)
+            Program.of("gather", coefficients, stencil, 0, dtype).share(coefficients, points, rows)
             expected = gather(coefficients, points, stencil)
             fine = ((points > -50) & (points < 50)).all(-1)[:, None, None].expand_as(rows)
             assert torch.allclose(rows[fine], expected[fine], rtol=1e-3, atol=1e-2 * float(expected[fine].abs().sum()))
             derivatives, raised = stencil.derivatives
-            if derivatives.order <= cpu.MAX_ORDER:
+            if derivatives.order <= MAX_ORDER:
                 gradient = guarded(torch.full((2, m, 3), 7, dtype=dtype), at_end)
-                cpu._run("pull", [coefficients], points, rows, derivatives, 0, raised, gradient)
+                pull = Program.of("pull", coefficients, derivatives, 0, dtype, raised)
+                pull.share(coefficients, points, rows, gradient)
             if stored == dtype:  # into volumes with room for one number behind them
                 room = guarded(torch.zeros(coefficients.numel() + 1, dtype=dtype), at_end)
-                cpu._run("scatter", [room[:-1].view_as(coefficients)], points, rows, stencil, 0)
+                target = room[:-1].view_as(coefficients)
+                Program.of("scatter", target, stencil, 0, dtype).divide([target], points, rows)
                 assert room[-1] == 0
 print("nothing outside was touched")
 """
 
 MARCH = r"""
+from dataclasses import replace
+
 from filterlab.kernels import bspline
-from filterlab.ops import Stencil, cpu
-from filterlab.ops.march import March, Rays, Transfer
+from filterlab.ops import Stencil
+from filterlab.ops.cpu.memory import has_room
+from filterlab.ops.differentiable import march as op
+from filterlab.ops.march import Chords, March, Transfer
 
 inside = torch.rand(40, 3, dtype=torch.float64) * 3 + 0.6
 inside[:2] = torch.tensor([[0.5] * 3, [3.5] * 3])
@@ -93,15 +101,15 @@ for dtype, stored, at_end, room in itertools.product(
 ):
     samples = torch.rand(5 * 5 * 5 + room).mul(1 if stored.is_floating_point else 100).to(stored)
     volume = guarded(samples, at_end)[:125].view(5, 5, 5)
-    assert cpu.has_room(volume) == bool(room)
+    assert has_room(volume) == bool(room)
     tables = Transfer(x.to(dtype), torch.rand(5, 3, dtype=dtype), x.to(dtype) / 3, 1.0)
-    own = Rays(entry, direction, length, torch.ones_like(length), torch.full((rays,), 40))
+    own = Chords(entry, direction, length, torch.ones_like(length), torch.full((rays,), 40))
     march = March(volume, 0, Stencil.jet((bspline(2),) * 3, 0), own, tables, None, 0.05)
-    light, depth = march.run()
-    expected, _ = March(samples[:125].view(5, 5, 5).clone(), *list(vars(march).values())[1:7]).run()
+    light, depth = op.run(march)
+    expected, _ = op.run(replace(march, coefficients=samples[:125].view(5, 5, 5).clone()))
     assert torch.equal(light[:40], expected[:40])
     assert light[:40].isfinite().all() and light[:40].max() > 0.1
-    march.adjoint(light, torch.ones_like(light), torch.ones_like(depth), ("coefficients", "rays", "table"))
+    op.adjoint(march, light, torch.ones_like(light), torch.ones_like(depth), ("coefficients", "rays", "table"))
 print("nothing outside was touched")
 """
 

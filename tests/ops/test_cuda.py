@@ -15,8 +15,10 @@ from filterlab import ops
 from filterlab.fields.ncrsi import NCRSI_TERMS
 from filterlab.fields.tensor_product import Direct, same_kernel
 from filterlab.kernels import CATMULL_ROM, CENTRAL_DIFFERENCE, KERNELS, LINEAR, TensorKernel, bspline
-from filterlab.ops import Product, Stencil, cuda, reference
+from filterlab.ops import Product, Stencil, cuda
+from filterlab.ops.cuda import gather as fused
 from filterlab.ops.cuda import launch, points
+from filterlab.ops.reference import gather as reference
 from tests.laws import assert_close
 
 SHAPE = (9, 8, 7)
@@ -186,7 +188,7 @@ def test_nothing_beyond_the_coefficients_is_read_or_written(kernel, device: str)
         walled.fill_(1.0)
         assert torch.equal(ops.gather(walled, p, stencil, START, "cuda")[0, 0, 0].isfinite(), finite[0])
         memory.zero_()
-        cuda._launch("scatter", walled, p, torch.ones(1, 1, 1, p.shape[1], dtype=dtype).to(device), stencil, START)
+        fused._launch("scatter", walled, p, torch.ones(1, 1, 1, p.shape[1], dtype=dtype).to(device), stencil, START)
     assert not memory[:wall].any()
     assert not memory[wall + volume :].any()
     assert walled.isfinite().all()
@@ -243,7 +245,7 @@ def test_derivatives_stay_in_the_implementation(device: str, monkeypatch: pytest
 
 
 def test_scatter_leaves_it_to_the_reference_to_be_deterministic(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda, "_launch", lambda *a: pytest.fail("atomic additions were launched"))
+    monkeypatch.setattr(fused, "_launch", lambda *a: pytest.fail("atomic additions were launched"))
     y, p = torch.ones(1, 1, 1, 4).to(device), torch.zeros(1, 4, 3).to(device)
     torch.use_deterministic_algorithms(True)
     try:
@@ -275,7 +277,7 @@ def test_compiles_for_a_gpu_that_need_not_be_there(name, operation, taps, monkey
     program = launch.launchable(getattr(points, operation)(stencil))
     types = {"coefficients": "*fp64", "points": "*fp64", "rows": "*fp64", "BLOCK": "constexpr"}
     signature = {p.name: types.get(p.name, "i32") for p in program.params}
-    made = compile(ASTSource(program, signature, {"BLOCK": cuda.BLOCK}), target=GPUTarget("cuda", 80, 32))
+    made = compile(ASTSource(program, signature, {"BLOCK": fused.BLOCK}), target=GPUTarget("cuda", 80, 32))
     lines = [line for line in made.asm["ptx"].splitlines() if ".global" in line]
     loads, additions = (sum(word in line for line in lines) for word in ("ld.global", "atom.global"))
     rows = len(stencil.rows)

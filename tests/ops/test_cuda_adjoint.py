@@ -15,8 +15,10 @@ pytest.importorskip("triton", reason="the package triton is not installed")
 from filterlab.kernels import LINEAR, bspline
 from filterlab.methods import reconstruct
 from filterlab.ops import Stencil, march
-from filterlab.ops.cuda import adjoint, launch, program
-from filterlab.ops.derivatives import GRADIENTS
+from filterlab.ops.cuda import adjoint, launch, segments
+from filterlab.ops.cuda import march as cuda
+from filterlab.ops.differentiable import march as op
+from filterlab.ops.march_derivatives import GRADIENTS
 from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.bricks import bricks_of
 from filterlab.render.plain import PlainMarcher
@@ -36,19 +38,19 @@ def prepared(method: str, transfer=SOFT, samples=None, dtype=torch.float64, **sc
 
     def noted(self: march.March, report=None):
         read.append(self)
-        rays = self.rays.count.shape[0]
+        rays = self.chords.count.shape[0]
         return torch.zeros(rays, 3, dtype=torch.float64), torch.zeros(rays, dtype=torch.float64)
 
     field = reconstruct(volume(dtype) if samples is None else samples, method, scheme="fused")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(march.March, "run", noted)
+        patch.setattr(op, "run", noted)
         render(field, camera_for(field), transfer, **{**SCENE, "dtype": dtype, **scene})
     return replace(read[0], bricks=None)
 
 
 def results(prepared: march.March) -> tuple[Tensor, Tensor, Tensor]:
     """Light, and cotangents of it and of the depth as an opacity has them: 0 of what is opaque."""
-    light, depth = prepared.run()
+    light, depth = op.run(prepared)
     generator = torch.Generator().manual_seed(7)
     to_light, to_depth = (torch.rand(x.shape, generator=generator, dtype=x.dtype) - 0.3 for x in (light, depth))
     return light, to_light, to_depth * torch.exp(-depth)
@@ -56,9 +58,8 @@ def results(prepared: march.March) -> tuple[Tensor, Tensor, Tensor]:
 
 def on_device(prepared: march.March, device: str, given: Sequence[Tensor], wanted: Collection[str] = GRADIENTS):
     """What the Triton program finds."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(march, "on_gpu", lambda tensor: True)
-        found = moved(prepared, device).adjoint(*(x.to(device) for x in given), wanted)
+    moved_to = moved(prepared, device)
+    found = op.adjoint(moved_to, *(x.to(device) for x in given), wanted, implementation="cuda")
     return {name: value.cpu() for name, value in found.items()}
 
 
@@ -76,7 +77,7 @@ def assert_agrees(prepared: march.March, device: str) -> dict[str, Tensor]:
     """With the CPU's adjoint, by everything."""
     given = results(prepared)
     found = on_device(prepared, device, given)
-    expected = prepared.adjoint(*given, GRADIENTS)
+    expected = op.adjoint(prepared, *given, GRADIENTS)
     assert_same(found, expected, TOLERANCE[prepared.dtype])
     return found
 
@@ -104,7 +105,7 @@ def test_behind_what_is_opaque(device: str) -> None:
     """α = 1 at control points: derivatives stay finite, and nothing behind has any."""
     transfer = TransferFunction([0.2, 0.5, 0.6], [[1.0, 0.5, 0.2]] * 3, [0.0, 1.0, 1.0], unit=0.1)
     marched = prepared("trilinear", transfer, shading=LIT)
-    assert (marched.run()[1] == math.inf).any()
+    assert (op.run(marched)[1] == math.inf).any()
     assert all(x.isfinite().all() for x in assert_agrees(marched, device).values())
 
 
@@ -131,14 +132,14 @@ def test_lanes_without_a_ray_and_rays_that_have_ended_add_nothing(device: str) -
     marched.coefficients[(-marched.start,) * 3] = math.nan
     entry, along = torch.tensor([[1, 0.5, 1], [3.5, 0, 2.5]]).double(), torch.tensor([[0, 1, 0], [0, 1, 0]]).double()
     length, offset, count = torch.tensor([5.0, 3.0]).double(), torch.ones(2).double(), torch.tensor([5, 3])
-    found = assert_agrees(replace(marched, rays=march.Rays(entry, along, length, offset, count), step=1.0), device)
+    found = assert_agrees(replace(marched, chords=march.Chords(entry, along, length, offset, count), step=1.0), device)
     assert all(x.isfinite().all() for x in found.values())
     assert found["opacities"].abs().min() > 1e-3
 
 
 @pytest.mark.parametrize("points", [1, 2, 6])
 def test_any_number_of_control_points(points: int, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(program, "BLOCK", 4)  # three programs that share two tables
+    monkeypatch.setattr(segments, "BLOCK", 4)  # three programs that share two tables
     monkeypatch.setattr(adjoint, "TABLES", 2)
     x = torch.linspace(0.2, 0.8, points, dtype=torch.float64)
     generator = torch.Generator().manual_seed(points)
@@ -171,7 +172,7 @@ def test_what_is_not_asked_is_not_computed(device: str) -> None:
         found = on_device(marched, device, given, [name])
         assert_same(found, {key: everything[key] for key in found}, 1e-14)
         assert found
-        text = str(adjoint._recipe(marched, (name,)).write())
+        text = str(cuda._recipe_of_adjoint(marched, (name,)).write())
         assert not [word for word in words if word in text], name
     assert on_device(marched, device, given, []) == {}
 
@@ -207,9 +208,9 @@ def test_coefficients_are_read_as_they_are_stored(stored: torch.dtype, device: s
 
 def test_no_rays(device: str) -> None:
     marched = prepared("trilinear", shading=LIT, size=(3, 2))
-    parts = {k: v[:0] for k, v in vars(marched.rays).items()}
+    parts = {k: v[:0] for k, v in vars(marched.chords).items()}
     lighting = replace(marched.lighting, toward=marched.lighting.toward[:0], halfway=marched.lighting.halfway[:0])
-    none = replace(marched, rays=march.Rays(**parts), lighting=lighting)
+    none = replace(marched, chords=march.Chords(**parts), lighting=lighting)
     found = on_device(none, device, results(none))
     assert found["entry"].shape == (0, 3)
     assert not any(x.any() for x in found.values())
@@ -250,14 +251,14 @@ def test_derivatives_of_an_image_are_the_plain_marchers(device: str, monkeypatch
     """And come from it where torch is told to be deterministic: atomic additions are not."""
     expected = _derivatives(device, "direct")
     if device == "cpu":  # the interpreter's tensors are
-        monkeypatch.setattr(march, "on_gpu", lambda tensor: True)
+        monkeypatch.setattr(op, "implementation_for", lambda tensor: "cuda")
     plainly, plain = [], PlainMarcher.march
     monkeypatch.setattr(PlainMarcher, "march", lambda *a: (plainly.append(1), plain(*a))[1])
     found = _derivatives(device, "fused")
     assert not plainly
     assert_same(found, expected, 1e-11)
     assert min(x.abs().max() for x in found.values()) > 1e-3
-    monkeypatch.setattr(adjoint, "run", None)
+    monkeypatch.setattr(cuda, "adjoint", None)
     torch.use_deterministic_algorithms(True)
     try:
         assert_same(_derivatives(device, "fused"), expected, 1e-11)
@@ -288,13 +289,13 @@ def test_compiles_for_a_gpu_that_need_not_be_there(
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
     derivatives, raised = stencil.derivatives
     recipe = adjoint.Recipe(GRADIENTS, stencil.lowered, (derivatives.lowered, raised), lights, skipping=True)
-    types = dict.fromkeys(program.arrays_of(recipe), "*fp64")
+    types = dict.fromkeys(segments.arrays_of(recipe), "*fp64")
     numbers = ("inner", "opacities", "colors", "shading", "view", "world", "coefficient_gradient")
     types |= dict.fromkeys(numbers, f"*{number}")
     types |= {"coefficients": f"*{stored}", "count": "*i64", "bricks": "*u8", "BLOCK": "constexpr"}
     written = launch.launchable(recipe.write())
     signature = {p.name: types.get(p.name, "i32") for p in written.params}
-    source = ASTSource(written, signature, {"BLOCK": program.BLOCK})
+    source = ASTSource(written, signature, {"BLOCK": segments.BLOCK})
     made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})
     lines = made.asm["ptx"].splitlines()
     assert not [line for line in lines if "bar.sync" in line]  # one warp waits for nobody

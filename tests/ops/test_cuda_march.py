@@ -15,8 +15,9 @@ pytest.importorskip("triton", reason="the package triton is not installed")
 from filterlab.kernels import LINEAR, bspline
 from filterlab.methods import reconstruct
 from filterlab.ops import Stencil, march
-from filterlab.ops.cuda import launch, program
+from filterlab.ops.cuda import compositing, launch, segments
 from filterlab.ops.cuda import march as cuda
+from filterlab.ops.differentiable import march as op
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.bricks import bricks_of
 from filterlab.volume import Volume
@@ -36,7 +37,7 @@ def moved(prepared: march.March, device: str) -> march.March:
         tensors = {k: v.to(device) for k, v in vars(part).items() if isinstance(v, Tensor)}
         return replace(part, **tensors)
 
-    parts = {k: on_device(v) for k in ("rays", "transfer", "lighting", "bricks") if (v := getattr(prepared, k))}
+    parts = {k: on_device(v) for k in ("chords", "transfer", "lighting", "bricks") if (v := getattr(prepared, k))}
     return replace(prepared, coefficients=prepared.coefficients.to(device), **parts)
 
 
@@ -44,10 +45,10 @@ def image(field, camera, transfer: TransferFunction, device: str, change=lambda 
     """What the Triton march renders; `change` may change what is marched."""
 
     def run(prepared: march.March, report=lambda rays: None):
-        return tuple(x.cpu() for x in cuda.run(change(moved(prepared, device)), report))
+        return tuple(x.cpu() for x in cuda.march(change(moved(prepared, device)), report))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(march.March, "run", run)
+        patch.setattr(op, "run", run)
         return render(field, camera, transfer, **{**SCENE, **scene})
 
 
@@ -108,13 +109,13 @@ def test_ends_behind_what_is_opaque(device: str) -> None:
     shown = image(field, camera_for(field), transfer, device, noted, dtype=torch.float64)
     assert_same((shown, render(field, camera_for(field), transfer, **SCENE, dtype=torch.float64)))
     assert shown[..., 3].max() == 1
-    _, depth = (x.cpu() for x in cuda.run(read[0]))
+    _, depth = (x.cpu() for x in cuda.march(read[0]))
     assert (depth == math.inf).any()
 
 
 @pytest.mark.parametrize("points", [1, 2, 6])
 def test_any_number_of_control_points(points: int, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(program, "BLOCK", 4)  # and of programs: one for every row of the image
+    monkeypatch.setattr(segments, "BLOCK", 4)  # and of programs: one for every row of the image
     x = torch.linspace(0.2, 0.8, points, dtype=torch.float64)
     generator = torch.Generator().manual_seed(points)
     rgb, alpha = (torch.rand(points, *more, generator=generator, dtype=torch.float64) for more in ((3,), ()))
@@ -198,15 +199,15 @@ def test_compiles_for_a_gpu_that_need_not_be_there(monkeypatch: pytest.MonkeyPat
     types = dict.fromkeys(("coefficients", "inner", "opacities", "colors", "shading", "view", "world"), "*fp32")
     types |= dict.fromkeys(("entry", "direction", "length", "offset", "numbers", "light", "optical_depth"), "*fp64")
     types |= {"count": "*i64", "bricks": "*u8", "BLOCK": "constexpr"}
-    written = launch.launchable(cuda.Recipe(Stencil.jet(LINEAR, 1).lowered, 1, skipping=True).write())
-    source = ASTSource(written, {p.name: types.get(p.name, "i32") for p in written.params}, {"BLOCK": program.BLOCK})
+    written = launch.launchable(compositing.Recipe(Stencil.jet(LINEAR, 1).lowered, 1, skipping=True).write())
+    source = ASTSource(written, {p.name: types.get(p.name, "i32") for p in written.params}, {"BLOCK": segments.BLOCK})
     made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})
     assert "bar.sync" not in made.asm["ptx"]  # one warp waits for nobody
 
 
 def test_what_a_scene_does_not_ask_for_is_not_computed() -> None:
-    unlit = str(cuda.Recipe(Stencil.jet(LINEAR, 0).lowered, None, skipping=False).write())
-    lit = str(cuda.Recipe(Stencil.jet(LINEAR, 1).lowered, 2, skipping=True).write())
+    unlit = str(compositing.Recipe(Stencil.jet(LINEAR, 0).lowered, None, skipping=False).write())
+    lit = str(compositing.Recipe(Stencil.jet(LINEAR, 1).lowered, 2, skipping=True).write())
     for word in ("row_1", "world", "view", "shading", "bricks +", "leap"):
         assert word in lit
         assert word not in unlit
@@ -215,22 +216,22 @@ def test_what_a_scene_does_not_ask_for_is_not_computed() -> None:
 def test_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     grid, stencil = torch.zeros(4, 4, 4), Stencil.jet(LINEAR, 1)
     monkeypatch.setenv("TRITON_INTERPRET", "1")
-    monkeypatch.setattr(march, "on_gpu", lambda tensor: True)
-    assert march.missing(grid, stencil, 0, torch.float32, 1) is None
-    assert "up to 8 lights; got 9" in str(march.missing(grid, stencil, 0, torch.float32, 9))
-    assert "supports go up to 6; got 7" in str(march.missing(grid, Stencil.jet(bspline(6), 0), 0, torch.float32, 0))
-    assert "got torch.float16" in str(march.missing(grid, stencil, 0, torch.float16, 0))
+    monkeypatch.setattr(op, "implementation_for", lambda tensor: "cuda")
+    assert op.missing(grid, stencil, 0, torch.float32, 1) is None
+    assert "up to 8 lights; got 9" in str(op.missing(grid, stencil, 0, torch.float32, 9))
+    assert "supports go up to 6; got 7" in str(op.missing(grid, Stencil.jet(bspline(6), 0), 0, torch.float32, 0))
+    assert "got torch.float16" in str(op.missing(grid, stencil, 0, torch.float16, 0))
     monkeypatch.setenv("TRITON_INTERPRET", "0")
-    assert "tensors of a GPU" in str(march.missing(grid, stencil, 0, torch.float32, 0))
+    assert "tensors of a GPU" in str(op.missing(grid, stencil, 0, torch.float32, 0))
 
 
 @pytest.mark.parametrize("shading", [None, LIT])
 def test_render_marches_there(shading: Shading | None, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """`render` itself, with a volume on the device."""
     if device == "cpu":  # the interpreter's tensors are
-        monkeypatch.setattr(march, "on_gpu", lambda tensor: True)
+        monkeypatch.setattr(op, "implementation_for", lambda tensor: "cuda")
     ran = []
-    monkeypatch.setattr(cuda, "run", lambda *a, run=cuda.run: (ran.append(1), run(*a))[1])
+    monkeypatch.setattr(cuda, "march", lambda *a, run=cuda.march: (ran.append(1), run(*a))[1])
     samples = blob().to(device)
     fields = [reconstruct(samples, "triquadratic", scheme=scheme) for scheme in ("fused", "direct")]
     transfer = TransferFunction([0.0, 0.1, 1.2], SOFT.colors, [0.0, 0.0, 0.9])

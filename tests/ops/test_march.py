@@ -15,6 +15,7 @@ from filterlab.kernels import LINEAR, TensorKernel, bspline
 from filterlab.ops import Stencil, march
 from filterlab.ops.cpu import compiler, frame, mathematics
 from filterlab.ops.cpu.lanes import I64, POINTER, Lanes
+from filterlab.ops.differentiable.march import missing
 
 LANES = {"float32": 8, "float64": 4}
 
@@ -98,7 +99,7 @@ def test_missing_says_what() -> None:
     volume, jet = torch.zeros(4, 4, 4), Stencil.jet(LINEAR, 1)
 
     def why(volume=volume, stencil=jet, dtype=torch.float32, lights=1) -> str | None:
-        return march.missing(volume, stencil, 0, dtype, lights)
+        return missing(volume, stencil, 0, dtype, lights)
 
     assert why() is None
     assert "up to 8 lights; got 9" in str(why(lights=9))

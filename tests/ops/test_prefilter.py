@@ -14,9 +14,9 @@ from torch import Tensor
 
 from filterlab.kernels import bspline
 from filterlab.ops import cpu
-from filterlab.ops import prefilter as op
-from filterlab.ops.fused import STORAGE
-from filterlab.ops.prefilter import implementation_for, missing, prefilter_axis, prefilter_samples
+from filterlab.ops.differentiable import prefilter as op
+from filterlab.ops.differentiable.prefilter import implementation_for, missing, prefilter_axis, prefilter_samples
+from filterlab.ops.gather import STORAGE
 from filterlab.prefilters import PREFILTERS, Prefilter, interpolation
 from filterlab.volume import Boundary
 from tests import laws, oracles
@@ -85,7 +85,7 @@ def test_any_number_of_lines_and_columns(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize(("lanes", "dtype"), [(4, torch.float32), (16, torch.float32), (8, torch.float64)], ids=str)
 def test_any_width_of_a_pack(lanes: int, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on machines with other vectors than this one; LLVM splits what is too wide."""
-    monkeypatch.setattr(cpu, "_lanes", lambda *_: lanes)
+    monkeypatch.setattr("filterlab.ops.cpu.prefilter.lanes_of", lambda _: lanes)
     for shape in ((3, 4, 5), (17, 33, 37), (2, 5, 270)):
         assert_volume_agrees(values(*shape, dtype=dtype), "cubic", "zeros", 3)
         assert_volume_agrees(values(*shape, dtype=dtype), "cubic")
@@ -198,9 +198,8 @@ GUARDED = r'''
 import ctypes, itertools, mmap
 import numpy as np
 import torch
-from filterlab.ops import cpu
 from filterlab.ops.cpu import prefilter as driver
-from filterlab.ops.prefilter import prefilter_axis, prefilter_samples
+from filterlab.ops.differentiable.prefilter import prefilter_axis, prefilter_samples
 
 PAGE = mmap.PAGESIZE
 libc = ctypes.CDLL(None, use_errno=True)
@@ -220,7 +219,7 @@ def guarded(shape, dtype, at_end):
 
 shapes = [(1, 1, 1), (2, 3, 5), (9, 8, 7), (3, 65, 4), (4, 3, 79), (2, 2, 3, 3, 17)]
 for at_end in (True, False):
-    cpu._fresh = lambda shape, dtype, make, room=0: guarded(shape, dtype, at_end)
+    driver.fresh = lambda shape, dtype, room=0: guarded(shape, dtype, at_end)
     driver._scratch = lambda size: guarded((size,), torch.uint8, at_end).numpy()
     for shape, stored, (boundary, tail) in itertools.product(
         shapes, (torch.float32, torch.float64, torch.uint8), (("mirror", 0), ("zeros", 3))
@@ -306,7 +305,7 @@ def test_gradients_equal_those_of_the_reference(boundary: Boundary) -> None:
 
 
 def test_derivatives_stay_in_the_implementation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(op, "_reference", lambda *a: pytest.fail("the reference was asked"))
+    monkeypatch.setattr(op.reference, "filter_axes", lambda *a: pytest.fail("the reference was asked"))
     x = values(3, 4, 5).requires_grad_()
 
     def squared(x: Tensor) -> Tensor:
@@ -370,7 +369,7 @@ def test_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(torch.compiler, "is_compiling", lambda: True)
         assert implementation_for(x) == "reference"
-    monkeypatch.setattr(cpu, "_llvmlite_problem", lambda: "the package llvmlite can't be loaded")
+    monkeypatch.setattr(cpu, "llvmlite_problem", lambda: "the package llvmlite can't be loaded")
     assert implementation_for(x) == "reference"
     with pytest.raises(ValueError, match="llvmlite can't be loaded"):
         prefilter_samples(x, "cubic", implementation="cpu")

@@ -15,7 +15,7 @@ from filterlab.fields.ncrsi import NCRSI_TERMS
 from filterlab.fields.tensor_product import Direct, same_kernel
 from filterlab.kernels import KERNELS, bspline
 from filterlab.methods import METHODS, reconstruct
-from filterlab.ops import march
+from filterlab.ops.differentiable import march
 from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction, bricks, fused, render
 
 LIT = Shading((Light((1.0, -2.0, 1.0)), Light()), ambient=0.3)
@@ -207,10 +207,8 @@ def test_skipping_changes_no_bit(method: str, dtype: torch.dtype, monkeypatch: p
     volume = ball().to(dtype)
     camera = PerspectiveCamera.framing(reconstruct(volume).domain, (0.4, 0.8, -0.45))
     used: list[bool] = []
-    run = march.March.run
-    monkeypatch.setattr(
-        march.March, "run", lambda self, *rest: used.append(self.bricks is not None) or run(self, *rest)
-    )
+    run = march.run
+    monkeypatch.setattr(march, "run", lambda self, *rest: used.append(self.bricks is not None) or run(self, *rest))
     for shading, step, jitter_seed in ((None, 0.5, None), (LIT, 0.13, 4), (None, 2.5, 1)):
         images = []
         for skipping in (False, True):

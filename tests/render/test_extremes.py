@@ -13,9 +13,9 @@ from torch import Tensor
 
 from filterlab.fields.base import Domain, Field
 from filterlab.methods import reconstruct
+from filterlab.ops.reference.optics import absorbed
 from filterlab.render import TransferFunction, render
 from filterlab.render.rays import jitter
-from filterlab.render.transfer import absorbed
 from filterlab.volume import Geometry, Volume
 
 SCHEMES = ("direct", "fused")

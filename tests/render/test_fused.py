@@ -12,7 +12,8 @@ from torch import Tensor
 from filterlab import signals
 from filterlab.methods import METHODS, reconstruct
 from filterlab.ops import march
-from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, fused, render
+from filterlab.ops.cpu import march as driver
+from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.plain import PlainMarcher
 from filterlab.volume import Boundary, Volume
 
@@ -263,7 +264,7 @@ def test_memory_threads_and_neighbours_change_no_bit(dtype: torch.dtype, monkeyp
     field = reconstruct(turned(samples(dtype)), scheme="fused")
     scene = {**SCENE, "shading": LIT, "dtype": dtype, "jitter_seed": 9, "termination": 0.01}
     expected = render(field, camera_for(field), PEAKS, **scene)
-    monkeypatch.setattr(fused.march, "RAYS_AT_ONCE", 37)
+    monkeypatch.setattr(driver, "RAYS_AT_ONCE", 37)
     threads = torch.get_num_threads()
     try:
         for count in (1, 2, 3):
@@ -279,7 +280,7 @@ def test_memory_threads_and_neighbours_change_no_bit(dtype: torch.dtype, monkeyp
 
 
 def test_progress_is_reported_along_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fused.march, "RAYS_AT_ONCE", 50)
+    monkeypatch.setattr(driver, "RAYS_AT_ONCE", 50)
     seen: list[tuple[int, int]] = []
     field = reconstruct(samples(), scheme="fused")
     render(field, camera_for(field), SOFT, **SCENE, progress=lambda done, total: seen.append((done, total)))

@@ -11,7 +11,7 @@ from filterlab.fields.base import Field
 from filterlab.io import save_volume
 from filterlab.io.config import ConfigError, dump_config
 from filterlab.methods import reconstruct
-from filterlab.ops import march
+from filterlab.ops.differentiable import march
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.scene import build, find_volume, load_scene, render_scene
 
@@ -84,8 +84,8 @@ def test_defaults_cost_nothing_and_overrides_change_what_they_name(scene_file, m
     assert isinstance(prepared.camera, PerspectiveCamera)
     assert all(prepared.options[k] is None for k in ("shading", "region", "jitter_seed", "termination"))
     lit = []
-    run = march.March.run
-    monkeypatch.setattr(march.March, "run", lambda m, *rest: lit.append(m.lighting) or run(m, *rest))
+    run = march.run
+    monkeypatch.setattr(march, "run", lambda m, *rest: lit.append(m.lighting) or run(m, *rest))
     render_scene(scene)
     assert lit == [None]
     changed = load_scene(path, {"method": "notch", "size": "[4, 6]", "camera.field_of_view": "20"})

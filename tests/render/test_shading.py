@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch.autograd import gradcheck, gradgradcheck
 
+from filterlab.ops.reference.optics import safe_normalize
 from filterlab.render import Light, Shading
-from filterlab.render.shading import safe_normalize
 
 
 def unit(v):

@@ -1,47 +1,27 @@
-"""gather and scatter as vector code for this processor, compiled at their first use.
+"""Every op as vector code for this processor, compiled at its first use.
 
     stencil ──▶ recipe ──generate──▶ LLVM IR ──compiler──▶ machine code ──▶ cache (disk)
                                                                 │
     tensors ──▶ job ────────────────────────────threads─────────┴──▶ result
 
-`taps` writes the sums (read it first, its head explains how they are computed), `lanes` the single instructions,
-`points` the program around them; `job` is what a program is told about the arrays; `compiler` and `cache` make and keep
-machine code; `threads` runs it.
-
-Same meaning as `ops.reference`, orders 0 … 3. Coefficients are read as they are stored, sums are in the points' dtype.
-The result of gather does not depend on the number of threads, bit by bit; that of scatter only on their number. Points
-that lie all over a large volume are sorted first (`order`).
+`gather`, `place`, `prefilter` and `march` describe arrays to programs as jobs and run them; `points`, `folding`,
+`recursion` and `compositing` write those programs, from the sums of `taps` (read it first, its head explains how they
+are computed) and the single instructions of `lanes`. `compiler` and `cache` make and keep machine code, `threads` runs
+it. What is here can be asked without llvmlite: whether they can run at all.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.ops.fused import MAX_ORDER as MAX_ORDER
-from filterlab.ops.fused import STORAGE, readable, unsupported
+from filterlab.ops.gather import unsupported
 from filterlab.ops.stencil import Stencil
-from filterlab.volume import Boundary
 
-if TYPE_CHECKING:
-    from filterlab.ops.cpu.job import Job
-    from filterlab.ops.cpu.order import Sorted
-    from filterlab.ops.placement import Placement
-
-FEWEST_SORTED = 1 << 16  # points of a batch entry
-SMALLEST_SORTED_IN = 16 << 20  # bytes of one channel
-SPLAT_MEMORY = 1 << 30  # bytes that scatter may take for partial results beyond the result itself
-
-_ARITHMETIC = {torch.float32: "float32", torch.float64: "float64"}
 _COORDINATES = {torch.float32: 1 << 24, torch.float64: 1 << 28}  # exact in the dtype; 8 times it fits 32 bits
-_POINTS_PER_THREAD = 4096  # fewer are not worth waking a thread for
-_CHUNKS_PER_THREAD = 16  # so that a thread that is held up leaves its share to the others
 
 
 def missing(
@@ -60,7 +40,7 @@ def missing(
         shape: (D, H, W) of the result of scatter.
         start: the coordinate of coefficient 0.
     """
-    if problem := _llvmlite_problem():
+    if problem := llvmlite_problem():
         return problem
     if coefficients.device.type != "cpu" or points.device.type != "cpu":
         return f"it works on tensors of the CPU; got {coefficients.device} and {points.device}"
@@ -73,275 +53,10 @@ def missing(
 
 
 @lru_cache
-def _llvmlite_problem() -> str | None:
+def llvmlite_problem() -> str | None:
+    """Why no program can be compiled here; None: they can."""
     try:
         import llvmlite.binding  # noqa: F401
     except (ImportError, OSError) as error:
         return f"the package llvmlite can't be loaded ({error}); pip install llvmlite"
     return None
-
-
-def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
-    """`ops.reference.gather`, fused. Nothing is copied but what is not contiguous within a channel or a batch entry."""
-    n, c = coefficients.shape[:2]
-    out = _fresh((n, c, len(stencil.rows), points.shape[1]), points.dtype, np.empty)
-    if out.numel() == 0:
-        return out
-    coefficients, points = readable(coefficients, 2), readable(points, 1)
-    if not _sorting_pays(points, coefficients.shape, coefficients.element_size()):
-        _run("gather", [coefficients] * _useful_threads(points), points, out, stencil, start)
-        return out
-    for entry, part, ordered in _in_order(points, coefficients.shape, start):
-        rows = _fresh((1, c, len(stencil.rows), ordered.count), points.dtype, np.empty)
-        threads = _useful_threads(ordered.points[None])
-        _run("gather", [coefficients[entry : entry + 1]] * threads, ordered.points[None], rows, stencil, start)
-        for channel in range(c):
-            ordered.restore(rows[0, channel], out[entry, channel, :, part])
-    return out
-
-
-def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int], start: int = 0) -> Tensor:
-    """`ops.reference.scatter`, fused.
-
-    Each thread takes an equal share of the points and adds into a partial result of its own; these are summed at the
-    end, in order. Partial results take at most `SPLAT_MEMORY` beyond the result itself: fewer threads work when the
-    volume is large, and when there are so few points that adding up would take longer than what is gained.
-    """
-    n, c = cotangents.shape[:2]
-    volume = n * c * shape[0] * shape[1] * shape[2]
-    threads = _useful_threads(points)
-    parts = min(threads, 1 + SPLAT_MEMORY // (volume * points.element_size() or 1))
-    parts = max(1, min(parts, 8 * n * c * points.shape[1] // (volume or 1)))
-    out = _zeros((n, c, *shape), points.dtype)
-    if not (cotangents.numel() and volume):
-        return out
-    more = [_zeros(out.shape, out.dtype) for _ in range(parts - 1)]
-    cotangents, points = readable(cotangents.to(points.dtype), 0), readable(points, 1)
-    if not _sorting_pays(points, out.shape, points.element_size()):
-        _run("scatter", [out, *more], points, cotangents, stencil, start)
-    else:
-        for entry, part, ordered in _in_order(points, out.shape, start):
-            rows = _fresh((1, *cotangents.shape[1:3], ordered.count), points.dtype, np.empty)
-            for channel in range(c):
-                ordered.arrange(cotangents[entry, channel, :, part], rows[0, channel])
-            own = [volume[entry : entry + 1] for volume in (out, *more)]
-            _run("scatter", own, ordered.points[None], rows, stencil, start)
-    for part in more:
-        out += part
-    return out.contiguous()
-
-
-def pull(coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
-    """The adjoint of gather to its points, (N, M, 3): Σ over channels and rows of cotangent · gradient of the row."""
-    out = _fresh(points.shape, points.dtype, np.zeros)
-    if cotangents.numel() == 0 or out.numel() == 0:
-        return out
-    coefficients, points = readable(coefficients, 2), readable(points, 1)
-    cotangents = readable(cotangents.to(points.dtype), 0)
-    threads = [coefficients] * _useful_threads(points)
-    derivatives, raised = stencil.derivatives
-    if not _sorting_pays(points, coefficients.shape, coefficients.element_size()):
-        _run("pull", threads, points, cotangents, derivatives, start, raised, out)
-        return out
-    for entry, part, ordered in _in_order(points, coefficients.shape, start):
-        rows = _fresh((1, *cotangents.shape[1:3], ordered.count), points.dtype, np.empty)
-        for channel in range(rows.shape[1]):
-            ordered.arrange(cotangents[entry, channel, :, part], rows[0, channel])
-        own = _fresh((1, ordered.count, 3), points.dtype, np.empty)
-        one = [volume[entry : entry + 1] for volume in threads]
-        _run("pull", one, ordered.points[None], rows, derivatives, start, raised, own)
-        back = _fresh((3, ordered.count), points.dtype, np.empty)
-        ordered.restore(own[0].T.contiguous(), back)
-        out[entry, part] = back.T
-    return out
-
-
-def _sorting_pays(points: Tensor, shape: Sequence[int], bytes_each: int) -> bool:
-    """Whether sorting points (N, M, 3) costs less than it saves (`order`); nothing is imported where it can't."""
-    if points.shape[1] < FEWEST_SORTED or math.prod(shape[2:]) * bytes_each < SMALLEST_SORTED_IN:
-        return False
-    from filterlab.ops.cpu import order
-
-    return order.scattered(points)
-
-
-def _in_order(points: Tensor, shape: Sequence[int], start: int) -> Iterator[tuple[int, slice, Sorted]]:
-    """(batch entry, which of its points, those points sorted), part by part, so that copies stay bounded."""
-    from filterlab.ops.cpu import compiler, order
-
-    lanes = _lanes(compiler.features(), points.element_size())
-    count = points.shape[1]
-    parts = -(-count // order.POINTS_AT_ONCE)
-    for entry, own in enumerate(points):
-        for i in range(parts):
-            part = slice(count * i // parts, count * (i + 1) // parts)
-            yield entry, part, order.Sorted(own[part], (shape[2], shape[3], shape[4]), start, lanes)
-
-
-def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor | None]:
-    """`ops.place`, fused: (located, sign); sign None where it is 1 everywhere."""
-    from filterlab.ops.cpu import compiler, folding
-    from filterlab.ops.cpu import threads as pool
-    from filterlab.ops.cpu.job import AXES
-
-    located = _fresh(points.shape, points.dtype, np.empty)
-    if points.numel() == 0:
-        return located, None
-    points = readable(points, 0)
-    lanes, geometry = _lanes(compiler.features(), points.element_size()), placement.geometry
-    count = points.numel() // 3
-    threads = max(1, min(torch.get_num_threads(), count // _POINTS_PER_THREAD))
-    packs = -(-count // lanes)
-    chunk = -(-packs // (threads * _CHUNKS_PER_THREAD if threads > 1 else 1))
-    chunks = -(-packs // chunk)
-    turned = np.zeros(chunks, np.int64)
-    job = folding.Job(
-        points=points.data_ptr(),
-        located=located.data_ptr(),
-        turned=turned.ctypes.data,
-        count=count,
-        chunk=chunk,
-        chunks=chunks,
-        shift=placement.shift,
-    )
-    for i, (a, n) in enumerate(zip(AXES, placement.size, strict=True)):
-        setattr(job, f"origin_{a}", geometry.origin[i])
-        low, high = placement.boundary.interval(n, placement.tail)
-        setattr(job, f"low_{a}", low)
-        setattr(job, f"high_{a}", high)
-        for j, b in enumerate(AXES):
-            setattr(job, f"matrix_{a}{b}", geometry.inverse[i][j])
-    x, y, z = (_how_it_folds(placement.boundary, n) for n in placement.size)
-    affine = "identity" if geometry.is_identity else "full" if geometry.diagonal is None else "diagonal"
-
-    def run(signs: bool) -> None:
-        recipe = folding.Recipe((x, y, z), affine, signs, _ARITHMETIC[points.dtype], lanes)
-        job.next = 0
-        pool.run(compiler.compiled(recipe), [job] * threads)
-
-    run(False)
-    if not turned.any():
-        return located, None
-    sign = _fresh(points.shape, points.dtype, np.empty)
-    job.signs = sign.data_ptr()
-    run(True)
-    return located, sign
-
-
-def _how_it_folds(boundary: Boundary, n: int) -> str:
-    if boundary is Boundary.MIRROR and n == 1:
-        return "flat"
-    return {Boundary.MIRROR: "reflect", Boundary.REFLECT: "reflect", Boundary.WRAP: "wrap"}.get(boundary, "clamp")
-
-
-def _fresh(shape: Sequence[int], dtype: torch.dtype, make: Callable[..., np.ndarray], room: int = 0) -> Tensor:
-    """A new tensor in memory that numpy allocated: it asks the system for huge pages, torch does not.
-
-    Measured on Linux: the first touch of 8 MB costs 0.4 ms instead of 7, as much as a third of a splat of 10⁶ points.
-
-    Args:
-        room: numbers that the storage has behind the tensor.
-    """
-    size = math.prod(shape)
-    return torch.from_numpy(make((size + room,), _ARITHMETIC[dtype]))[:size].view(tuple(shape))
-
-
-def has_room(tensor: Tensor) -> bool:
-    """Whether the storage of a contiguous tensor goes on behind it, by a number at least."""
-    size = tensor.element_size()
-    return tensor.untyped_storage().nbytes() >= (tensor.storage_offset() + tensor.numel() + 1) * size
-
-
-def _zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """What scatter adds into, (N, ...), with room for one number behind every entry: three taps are added as four.
-
-    Threads may work on two entries of one volume at a time, so that the room of one may not be part of the next.
-    """
-    size = math.prod(shape[1:])
-    memory = np.zeros((shape[0], size + 1), _ARITHMETIC[dtype])
-    return torch.from_numpy(memory[:, :size].reshape(tuple(shape)))  # a view: only the last axis is split
-
-
-def _run(
-    operation: str,
-    volumes: Sequence[Tensor],
-    points: Tensor,
-    rows: Tensor,
-    stencil: Stencil,
-    start: int,
-    raised: tuple[tuple[int, ...], ...] = (),
-    gradient: Tensor | None = None,
-) -> None:
-    """Compile, describe the arrays, and let the threads loose, one for each of `volumes`.
-
-    Args:
-        operation: "gather", "scatter" or "pull".
-        volumes: for gather and pull the coefficients, as often as there are threads: all of them share the work, chunk
-            by chunk. For scatter as many volumes of `_zeros`: each is given an equal share of the points.
-        points, stencil, start: as for `gather`.
-        rows: (N, C, J, M), contiguous; written by gather, read by scatter and pull.
-        raised, gradient: for pull, as in its recipe and its result.
-    """
-    from filterlab.ops.cpu import compiler
-    from filterlab.ops.cpu import threads as pool
-    from filterlab.ops.cpu.job import AXES, Job
-    from filterlab.ops.cpu.points import BLOCK, Recipe
-
-    coefficients, threads = volumes[0], len(volumes)
-    assert all(t.data_ptr() for t in (*volumes, points, rows)), "tensors without memory"
-    arithmetic, storage = _ARITHMETIC[points.dtype], STORAGE[coefficients.dtype]
-    lanes = _lanes(compiler.features(), points.element_size())
-    function = compiler.compiled(Recipe(operation, stencil.lowered, arithmetic, storage, lanes, raised))
-
-    entries, count = points.shape[:2]
-    packs = -(-count // lanes)
-    shared = operation != "scatter"
-    chunk = -(-packs // (threads * _CHUNKS_PER_THREAD if shared and threads > 1 else threads))
-    chunk = -(-chunk // BLOCK) * BLOCK
-    parts = -(-packs // chunk)  # of every batch entry
-    d, h, w = coefficients.shape[2:]
-    job = Job(
-        coefficients=coefficients.data_ptr(),
-        points=points.data_ptr(),
-        rows=rows.data_ptr(),
-        gradient=None if gradient is None else gradient.data_ptr(),
-        channels=coefficients.shape[1],
-        count=count,
-        width=w,
-        height=h,
-        start=start,
-        coefficients_entry=coefficients.stride(0),
-        coefficients_channel=coefficients.stride(1),
-        points_entry=points.stride(0),
-        chunk=chunk,
-        entries=entries,
-        next=0,
-        chunks=parts * entries,
-    )
-    for axis, size, support in zip(AXES, (w, h, d), stencil.supports, strict=True):
-        setattr(job, f"low_{axis}", start)
-        setattr(job, f"high_{axis}", start + size - support)
-    pool.run(function, [job] * threads if shared else [_own_share(job, i, v) for i, v in enumerate(volumes[:parts])])
-
-
-def _own_share(job: Job, part: int, volume: Tensor) -> Job:
-    """The job of adding one part of every batch entry's points to a volume of its own."""
-    from filterlab.ops.cpu.job import Job
-
-    own = Job.from_buffer_copy(job)
-    own.coefficients = volume.data_ptr()
-    own.next, own.chunks = part * job.entries, (part + 1) * job.entries
-    return own
-
-
-def _lanes(features: frozenset[str], element_size: int) -> int:
-    """P: 8 floats or 4 doubles; twice as many with AVX-512.
-
-    Measured with AVX2 (Zen 3), where 8 floats fill a register: 16 lanes need two, the weights of a 3×3×3 kernel no
-    longer fit and jets become 1.0 to 1.5 times, splats 1.3 to 1.9 times as slow.
-    """
-    return (64 if "avx512f" in features else 32) // element_size
-
-
-def _useful_threads(points: Tensor) -> int:
-    return max(1, min(torch.get_num_threads(), points.shape[0] * points.shape[1] // _POINTS_PER_THREAD))

@@ -41,7 +41,7 @@ from llvmlite import ir
 from filterlab.ops.cpu import mathematics
 from filterlab.ops.cpu.lanes import DOUBLE, I32, I64, Lanes, Value
 from filterlab.ops.cpu.tape import Node, Tape
-from filterlab.ops.cpu.taps import _lanes_of_groups, _transpose_quads
+from filterlab.ops.cpu.taps import lanes_of_groups, transpose_quads
 
 OPACITY_ROW, COLOR_ROW, BUCKET_ROW = 4, 8, 8  # numbers of a row
 
@@ -189,7 +189,7 @@ class TransferTable:
         for lane in range(e.count):
             place = b.add(b.zext(e.lane(start, lane), I64), I64(first))
             quads.append(e.load(e.advance(table, place, e.number), e.number, 4))
-        return _transpose_quads(e, [e.join(_lanes_of_groups(quads, (k,))) for k in range(4)])
+        return transpose_quads(e, [e.join(lanes_of_groups(quads, (k,))) for k in range(4)])
 
     def add_to_rows(
         self, tables: Sequence[Value], interval: Value, packs: Sequence[Value], width: int, first: int
@@ -200,7 +200,7 @@ class TransferTable:
         """
         e, b = self.lanes, self.lanes.builder
         padded = [*packs, *[e.constant(0)] * (4 - len(packs))]
-        groups = _transpose_quads(e, padded)
+        groups = transpose_quads(e, padded)
         wide = ir.VectorType(DOUBLE, 4)
         for lane in range(e.count):
             own = groups[lane % 4]

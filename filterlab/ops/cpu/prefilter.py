@@ -1,6 +1,6 @@
 """The prefilter as vector code for this processor: describes the arrays to the program of `ops.cpu.recursion`.
 
-Same meaning as the reference in `ops.prefilter`, any number of poles. Memory: the result, and for every thread a
+Same meaning as `ops.reference.prefilter`, any number of poles. Memory: the result, and for every thread a
 scratch array of two bundles of lines (n + warm-up numbers each, at most 64 lines: about 140 KB for 256 voxels). Samples
 are read as they are stored, through any strides but along x; what lies otherwise is copied first. Never written to.
 """
@@ -14,57 +14,52 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.ops import cpu
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
+from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, lanes_of, threads_for
+from filterlab.ops.cpu.memory import ARITHMETIC, fresh
 from filterlab.ops.cpu.recursion import Job, Recipe
-from filterlab.ops.fused import STORAGE
-from filterlab.prefilters import Prefilter
+from filterlab.ops.gather import STORAGE
+from filterlab.ops.prefilter import Filtering
 from filterlab.volume import Boundary
 
 _STATES = (
     8  # packs that a bundle's recursions remember, K times the poles; with AVX2 2 are slower by a quarter, so are 16
 )
 _NUMBERS_PER_THREAD = 1 << 16  # fewer are not worth waking a thread for
-_CHUNKS_PER_THREAD = 16
 _ALIGNMENT = 64  # bytes of a cache line
 
 
-def filter_axes(samples: Tensor, dims: tuple[int, ...], prefilter: Prefilter, boundary: Boundary, tail: int) -> Tensor:
-    """Coefficients along one axis or all three; no derivatives.
+def filter_axes(samples: Tensor, how: Filtering) -> Tensor:
+    """Coefficients along one axis or all three, of a prefilter with at least one pole; no derivatives.
 
     Args:
-        samples: real, of a dtype that `ops.cpu` reads.
-        dims: (-3, -2, -1), or a single axis, negative.
-        prefilter: with at least one pole.
-        tail: coefficients beyond each end; negative: that many fewer.
+        samples: real, of a dtype of `ops.gather.STORAGE`.
     """
     dtype = torch.promote_types(samples.dtype, torch.float32)
     samples = samples.detach().resolve_neg()
     shape = list(samples.shape)
-    for dim in dims:
-        shape[dim] += 2 * tail
+    for dim in how.dims:
+        shape[dim] += 2 * how.tail
     if 0 in shape:
         return samples.new_empty(shape, dtype=dtype)
-    if len(dims) == 1 or tail < 0:
-        for dim in dims:
-            samples = _Filter(samples, dtype, prefilter, boundary, tail).along(dim)
+    if len(how.dims) == 1 or how.tail < 0:
+        for dim in how.dims:
+            samples = _Filter(samples, dtype, how).along(dim)
         return samples
-    return _Filter(samples, dtype, prefilter, boundary, tail).volume()
+    return _Filter(samples, dtype, how).volume()
 
 
 class _Filter:
     """One call: the samples and how they are to be filtered."""
 
-    def __init__(
-        self, samples: Tensor, dtype: torch.dtype, prefilter: Prefilter, boundary: Boundary, tail: int
-    ) -> None:
-        self.samples, self.dtype, self.prefilter, self.boundary, self.tail = samples, dtype, prefilter, boundary, tail
-        self.warm_up = prefilter.decay(dtype)
-        self.poles = np.array(prefilter.poles)
-        self.gain = math.prod((1 - z) ** 2 for z in prefilter.poles)
-        self.lanes = cpu._lanes(compiler.features(), dtype.itemsize)
-        self.packs = max(1, _STATES // len(prefilter.poles))
+    def __init__(self, samples: Tensor, dtype: torch.dtype, how: Filtering) -> None:
+        self.samples, self.dtype, self.boundary, self.tail = samples, dtype, how.boundary, how.tail
+        self.warm_up = how.prefilter.decay(dtype)
+        self.poles = np.array(how.prefilter.poles)
+        self.gain = math.prod((1 - z) ** 2 for z in how.prefilter.poles)
+        self.lanes = lanes_of(dtype)
+        self.packs = max(1, _STATES // len(self.poles))
         self.bundle = self.lanes * self.packs
 
     def volume(self) -> Tensor:
@@ -155,8 +150,8 @@ class _Filter:
 
     def _run(self, columns: bool, source: Tensor, target: Tensor, **fields: float) -> None:
         """Compile, add what all jobs need, and let the threads loose."""
-        storage, arithmetic = STORAGE[source.dtype], cpu._ARITHMETIC[self.dtype]
-        recipe = Recipe(columns, len(self.prefilter.poles), arithmetic, storage, self.lanes, self.packs)
+        storage, arithmetic = STORAGE[source.dtype], ARITHMETIC[self.dtype]
+        recipe = Recipe(columns, len(self.poles), arithmetic, storage, self.lanes, self.packs)
         function = compiler.compiled(recipe)
         longest = max(fields["count"], fields.get("count_y", 0))
         transposed = _rounded(int(longest + self.warm_up) * self.bundle, _ALIGNMENT)
@@ -180,7 +175,7 @@ class _Filter:
         pool.run(function, [job] * threads)
 
     def _fresh(self, shape: tuple[int, ...]) -> Tensor:
-        return cpu._fresh(shape, self.dtype, np.empty, room=1)  # lines of three coefficients are read as four
+        return fresh(shape, self.dtype, room=1)  # lines of three coefficients are read as four
 
     def _with_neighbours(self, samples: Tensor) -> Tensor:
         """The samples with neighbours along the last axis lying together."""
@@ -190,11 +185,11 @@ class _Filter:
         return _places(self.boundary, n, self.tail + self.warm_up)
 
     def _threads(self, numbers: int) -> int:
-        return max(1, min(torch.get_num_threads(), numbers // _NUMBERS_PER_THREAD))
+        return threads_for(numbers, _NUMBERS_PER_THREAD)
 
     def _part(self, lines: int, entries: int = 1) -> int:
         """Neighbouring lines of a chunk: whole bundles, few enough that all threads have enough to take."""
-        chunks = max(1, self._threads(self.samples.numel()) * _CHUNKS_PER_THREAD // entries)
+        chunks = max(1, self._threads(self.samples.numel()) * CHUNKS_PER_THREAD // entries)
         return _rounded(max(1, lines // chunks), self.bundle)
 
 

@@ -371,8 +371,8 @@ class Taps:
         if taps == 1:
             return [e.join(rows)]
         if taps == 2:
-            return _transpose_pairs(e, [e.join(_lanes_of_groups(rows, k)) for k in ((0, 1), (2, 3))])
-        return _transpose_quads(e, [e.join(_lanes_of_groups(rows, (k,))) for k in range(4)])[:taps]
+            return _transpose_pairs(e, [e.join(lanes_of_groups(rows, k)) for k in ((0, 1), (2, 3))])
+        return transpose_quads(e, [e.join(lanes_of_groups(rows, (k,))) for k in range(4)])[:taps]
 
     def _add_lines(
         self, taps: list[Value], plane_offset: Value, needed: dict[int, range], values: dict[int, list[Value]]
@@ -403,14 +403,14 @@ class Taps:
         if taps == 2:
             joined = _interleave_pairs(e, packs)
             return [e.shuffle(joined[i % 4 // 2], joined[i % 4 // 2], _places(i, 2)) for i in range(e.count)]
-        joined = _transpose_quads(e, [*packs, *[e.constant(0)] * (4 - taps)])
+        joined = transpose_quads(e, [*packs, *[e.constant(0)] * (4 - taps)])
         return [e.shuffle(joined[i % 4], joined[i % 4], _places(i, 4)) for i in range(e.count)]
 
 
 # --- transpositions; a group is four lanes --------------------------------------------------------------------------
 
 
-def _lanes_of_groups(vectors: list[Value], lanes: tuple[int, ...]) -> list[Value]:
+def lanes_of_groups(vectors: list[Value], lanes: tuple[int, ...]) -> list[Value]:
     """The vectors of those lanes of every group."""
     return [vectors[group + k] for group in range(0, len(vectors), 4) for k in lanes]
 
@@ -420,7 +420,7 @@ def _in_groups(e: Lanes, a: Value, b: Value, pattern: Sequence[int]) -> Value:
     return e.shuffle(a, b, [g + k if k < 4 else e.count + g + k - 4 for g in range(0, e.count, 4) for k in pattern])
 
 
-def _transpose_quads(e: Lanes, rows: list[Value]) -> list[Value]:
+def transpose_quads(e: Lanes, rows: list[Value]) -> list[Value]:
     """Four registers, row k holding the four taps of lane k of every group -> tap k of every lane; its own inverse."""
     a, b, c, d = rows
     low = _in_groups(e, a, b, (0, 4, 1, 5)), _in_groups(e, c, d, (0, 4, 1, 5))  # a0 b0 a1 b1 and c0 d0 c1 d1

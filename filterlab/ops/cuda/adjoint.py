@@ -1,6 +1,6 @@
 """The adjoint of the march as one Triton program: derivatives of light and depth by all that they are made of.
 
-It marches the same way again (`program`), front to back, and needs nothing but the result: what segment i changes
+It marches the same way again (`segments`), front to back, and needs nothing but the result: what segment i changes
 behind itself is the rest of the light, known from what has passed. With g the cotangent of the light, γ_i = g · c_i:
 
     τ̄_i = γ_i T_{i+1} − (g · light − Σ_{j≤i} w_j γ_j) + cotangent of the depth        c̄_i = w_i g
@@ -20,25 +20,18 @@ It was run in Triton's interpreter and compiled for GPUs, but not timed on one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-import torch
-from torch import Tensor
 
 from filterlab.ops.cuda import optics
 from filterlab.ops.cuda.optics import RGB, Located
-from filterlab.ops.cuda.program import Program, launch
+from filterlab.ops.cuda.segments import Program
 from filterlab.ops.cuda.source import Source
 from filterlab.ops.cuda.tape import Node, Tape
 from filterlab.ops.cuda.taps import AXES
-from filterlab.ops.derivatives import TABLE_ROW, by_name, columns_of_rays, gradient_columns
+from filterlab.ops.march_derivatives import TABLE_ROW, columns_of_rays, gradient_columns
 from filterlab.ops.stencil import Lowered
-
-if TYPE_CHECKING:
-    from filterlab.ops.march import March
 
 TABLES = 64
 _ENDS = 10  # numbers of a row of the table that mean something
@@ -46,10 +39,10 @@ _ENDS = 10  # numbers of a row of the table that mean something
 
 @dataclass(frozen=True)
 class Recipe:
-    """See `ops.cuda.program.Recipe`.
+    """See `ops.cuda.segments.Recipe`.
 
     Attributes:
-        gradients: what is asked, of `ops.derivatives.GRADIENTS`.
+        gradients: what is asked, of `ops.march_derivatives.GRADIENTS`.
         derivatives: the stencil of its rows' derivatives, and `raised` as in `Stencil.derivatives`; for "rays".
         tables: how many there are.
     """
@@ -63,7 +56,7 @@ class Recipe:
 
     @property
     def own(self) -> tuple[str, ...]:
-        """Shapes as in `ops.cpu.march.FIELDS`, but for the tables, (tables, intervals, 12)."""
+        """Shapes as in `ops.cpu.compositing.FIELDS`, but for the tables, (tables, intervals, 12)."""
         targets = {"coefficients": "coefficient_gradient", "table": "table_gradient"}
         by_ray = ("ray_gradient",) if {"rays", "shading"} & set(self.gradients) else ()
         asked = tuple(target for name, target in targets.items() if name in self.gradients)
@@ -204,43 +197,3 @@ class _Adjoint(Program):
 
 def _width(columns: slice) -> int:
     return columns.stop - columns.start
-
-
-def run(
-    march: March,
-    gradients: tuple[str, ...],
-    given: dict[str, Tensor],
-    report: Callable[[int], None] = lambda rays: None,
-) -> dict[str, Tensor]:
-    """`ops.march.March.adjoint` on the device of its tensors.
-
-    Args:
-        gradients: of `ops.derivatives.GRADIENTS`.
-        given: light, light_cotangent, depth_cotangent.
-    """
-    lights = None if march.lighting is None else march.lighting.lights
-    rays, points = march.rays.count.shape[0], len(march.transfer.positions)
-
-    def zeros(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
-        return torch.zeros(shape, dtype=dtype, device=march.coefficients.device)
-
-    volume = zeros(*march.coefficients.shape, dtype=march.dtype) if "coefficients" in gradients else None
-    tables = zeros(TABLES, max(points - 1, 1), TABLE_ROW)
-    by_ray = zeros(rays, columns_of_rays(lights))
-    if rays and gradients:
-        targets = {"coefficient_gradient": volume, "table_gradient": tables, "ray_gradient": by_ray}
-        launch(_recipe(march, gradients), march, given | {name: t for name, t in targets.items() if t is not None})
-        report(rays)
-    return by_name(gradients, volume, by_ray, tables.sum(0), points, lights)
-
-
-def _recipe(march: March, gradients: tuple[str, ...]) -> Recipe:
-    raised = march.stencil.derivatives if "rays" in gradients else None
-    return Recipe(
-        gradients,
-        march.stencil.lowered,
-        None if raised is None else (raised[0].lowered, raised[1]),
-        None if march.lighting is None else march.lighting.lights,
-        march.bricks is not None,
-        TABLES,
-    )

@@ -1,82 +1,102 @@
-"""The march as one Triton program: rays in, light and optical depth out. `ops.march` says what it means.
+"""The march and its adjoint in Triton: describes rays and tables to their programs, and launches those.
 
-`program` tells how rays are cut and go on (read it first). Of every sample then:
-
-    optics      opacity α by a binary search among the control points, optical depth τ (`ops.cuda.optics`)
-    compose     T = exp(−depth), weight w = T (1 − e^{−τ}); light += w · colour, depth += τ
-
-What no ray of the warp needs is not computed: colours and lights where all weights are 0. τ and w keep their digits for
-small α and τ, where log and exp alone would lose them.
-
-It was run in Triton's interpreter and compiled for GPUs, but not timed on one; double precision is slow on many.
+Memory beyond the result: as on the CPU (`ops.cpu.march`), but one volume of derivatives by the coefficients, and 6 KiB
+per interval of the transfer function.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from filterlab.ops.cuda import optics
-from filterlab.ops.cuda.optics import RGB
-from filterlab.ops.cuda.program import Program, launch
-from filterlab.ops.cuda.source import Source
-from filterlab.ops.cuda.tape import Node, Tape
-from filterlab.ops.stencil import Lowered
+from filterlab.ops.cuda import adjoint as backward
+from filterlab.ops.cuda import compositing, segments
+from filterlab.ops.cuda.launch import interpreting, launchable
+from filterlab.ops.cuda.segments import Recipe, arrays_of
+from filterlab.ops.march import March
+from filterlab.ops.march_derivatives import TABLE_ROW, by_name, columns_of_rays
 
-if TYPE_CHECKING:
-    from filterlab.ops.march import March
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """See `ops.cuda.program.Recipe`."""
-
-    stencil: Lowered
-    lights: int | None
-    skipping: bool
-    own = ("light", "optical_depth")
-
-    def write(self) -> Source:
-        return _March("march", self).write()
+Report = Callable[[int], None]
 
 
-class _March(Program):
-    def begin(self) -> None:
-        for k in RGB:
-            self.line(f"light_{k} = tl.full((BLOCK,), 0.0, tl.float64)")
-
-    def sample(self) -> None:
-        tape, rows = Tape(self.source), self.rows(active=False)
-        located = optics.locate(tape, rows[0], active=False)
-        optics.optical_depth(tape, optics.opacity(tape, located), Node("thickness", active=False))
-        self.weights()
-        self.pass_on()
-        self.line("seen = weight != 0.0")
-        with self.if_any("seen"):
-            color = optics.color(tape, located, optics.color_ends(tape, active=False))
-            color = self.lit(tape, color, rows, self.uniform(active=False))
-            for k in RGB:
-                self.line(f"light_{k} += tl.where(seen, weight * {color[k]}, 0.0).to(tl.float64)")
-
-    def end(self) -> None:
-        for k in RGB:
-            self.line(f"tl.store(light + 3 * ray + {k}, light_{k}, inside)")
-        self.line("tl.store(optical_depth + ray, passed, inside)")
-
-
-@torch.no_grad()
-def run(march: March, report: Callable[[int], None] = lambda rays: None) -> tuple[Tensor, Tensor]:
-    """`ops.march.March.run` on the device of its tensors: light (R, 3) and optical depth (R,), float64."""
-    rays, device = march.rays.count.shape[0], march.coefficients.device
-    light = torch.zeros(rays, 3, dtype=torch.float64, device=device)
-    depth = torch.zeros(rays, dtype=torch.float64, device=device)
+def march(given: March, report: Report = lambda rays: None) -> tuple[Tensor, Tensor]:
+    """`ops.reference.march.march`, fused, without derivatives: light (R, 3) and optical depth (R,), float64."""
+    rays = len(given.chords.count)
+    light, depth = _zeros(given, rays, 3), _zeros(given, rays)
     if rays:
-        lights = None if march.lighting is None else march.lighting.lights
-        recipe = Recipe(march.stencil.lowered, lights, march.bricks is not None)
-        launch(recipe, march, {"light": light, "optical_depth": depth})
+        recipe = compositing.Recipe(given.stencil.lowered, given.lights, given.bricks is not None)
+        _launch(recipe, given, {"light": light, "optical_depth": depth})
         report(rays)
     return light, depth
+
+
+def adjoint(
+    given: March, gradients: tuple[str, ...], arrays: Mapping[str, Tensor], report: Report = lambda rays: None
+) -> dict[str, Tensor]:
+    """Derivatives of Σ light · its cotangent + Σ depth · its cotangent; see `ops.differentiable.march.adjoint`.
+
+    Those by coefficients and table are added atomically, and repeat themselves up to rounding only.
+
+    Args:
+        gradients: of `ops.march_derivatives.GRADIENTS`.
+        arrays: light, light_cotangent, depth_cotangent.
+    """
+    rays, points = len(given.chords.count), len(given.transfer.positions)
+    volume = _zeros(given, *given.coefficients.shape, dtype=given.dtype) if "coefficients" in gradients else None
+    tables = _zeros(given, backward.TABLES, max(points - 1, 1), TABLE_ROW)
+    by_ray = _zeros(given, rays, columns_of_rays(given.lights))
+    if rays and gradients:
+        targets = {"coefficient_gradient": volume, "table_gradient": tables, "ray_gradient": by_ray}
+        written = {name: target for name, target in targets.items() if target is not None}
+        _launch(_recipe_of_adjoint(given, gradients), given, {**arrays, **written})
+        report(rays)
+    return by_name(gradients, volume, by_ray, tables.sum(0), points, given.lights)
+
+
+def _recipe_of_adjoint(given: March, gradients: tuple[str, ...]) -> backward.Recipe:
+    raised = given.stencil.derivatives if "rays" in gradients else None
+    derivatives = None if raised is None else (raised[0].lowered, raised[1])
+    skipping = given.bricks is not None
+    return backward.Recipe(gradients, given.stencil.lowered, derivatives, given.lights, skipping, backward.TABLES)
+
+
+def _zeros(given: March, *shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.zeros(shape, dtype=dtype, device=given.coefficients.device)
+
+
+def _launch(recipe: Recipe, given: March, own: Mapping[str, Tensor]) -> None:
+    """Run the program for all rays of a march.
+
+    Args:
+        own: the arrays of `recipe.own`; contiguous where they are written.
+    """
+    arrays = {"coefficients": given.coefficients, **given.inputs, "numbers": _numbers(given), **own}
+    handed = [arrays[name].detach().resolve_neg().contiguous() for name in arrays_of(recipe)]
+    programs = -(-len(given.chords.count) // segments.BLOCK)
+    with torch.cuda.device_of(handed[0]):  # Triton launches on the current device
+        _program(recipe, interpreting())[(programs,)](*handed, *_sizes(given), BLOCK=segments.BLOCK, num_warps=1)
+
+
+def _numbers(given: March) -> Tensor:
+    """In the order of `segments.NUMBERS`."""
+    numbers = (given.step, 1 / given.transfer.unit, given.opaque, given.slack, math.inf)
+    return torch.tensor(numbers, dtype=torch.float64, device=given.coefficients.device)
+
+
+def _sizes(given: March) -> tuple[int, ...]:
+    """In the order of `segments.SIZES`."""
+    bricks = (0, 0, 0) if given.bricks is None else given.bricks.distance.shape
+    edge = given.bricks.edge if given.bricks else 0
+    inner = max(len(given.transfer.positions) - 2, 0)  # control points between the first and the last
+    shape = given.coefficients.shape
+    return len(given.chords.count), *shape, given.start, inner.bit_length(), inner, bricks[1], bricks[2], edge
+
+
+@lru_cache(maxsize=256)
+def _program(recipe: Recipe, interpreted: bool) -> Any:
+    return launchable(recipe.write())

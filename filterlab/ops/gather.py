@@ -1,4 +1,11 @@
-"""What the fused implementations have in common: which numbers they read, which stencils they sum."""
+"""gather and its transpose scatter, described: which numbers they read, which stencils the fused ones sum.
+
+    gather     rows (N, C, J, M) of a stencil at M points, from coefficients (N, C, D, H, W)
+    scatter    the transpose of that: rows at points, added up in coefficients
+    pull       the adjoint of gather to its points (N, M, 3)
+
+`ops.reference.gather` says exactly what is computed.
+"""
 
 from __future__ import annotations
 
@@ -44,6 +51,8 @@ def unsupported(
 
 def readable(tensor: Tensor, outer: int) -> Tensor:
     """The tensor with everything after its first `outer` dimensions lying together; any strides before (0 too)."""
+    if tensor.is_contiguous() and not tensor.is_neg():
+        return tensor
     tensor = tensor.detach().resolve_neg()
     together = tensor[(0,) * outer].is_contiguous()
     return tensor if together else tensor.contiguous()

@@ -11,19 +11,23 @@ third and higher derivatives of a value-and-gradient jet).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from filterlab.ops import cpu, cuda, reference
+from filterlab.ops import cpu, cuda
+from filterlab.ops.differentiable.recording import plain, transformed
+from filterlab.ops.gather import MAX_ORDER
+from filterlab.ops.reference import gather as reference
 from filterlab.ops.stencil import Stencil
 
 
-class Implementation(Protocol):
-    """What computes a gather and a scatter, without derivatives; see `ops.reference` for the meaning."""
+class Sums(Protocol):
+    """What computes a gather and a scatter, without derivatives; see `ops.reference.gather` for the meaning."""
 
     def gather(self, coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0) -> Tensor: ...
     def scatter(
@@ -31,14 +35,55 @@ class Implementation(Protocol):
     ) -> Tensor: ...
 
 
-IMPLEMENTATIONS: dict[str, Implementation] = {"reference": reference, "cpu": cpu, "cuda": cuda}
-MAX_ORDER = {"cpu": cpu.MAX_ORDER, "cuda": cuda.MAX_ORDER}
-MISSING = {"cpu": cpu.missing, "cuda": cuda.missing}
-"""Of every implementation that can't do everything: what says why not."""
+@dataclass(frozen=True)
+class Implementation:
+    """A way to compute gather and scatter.
+
+    Attributes:
+        load: imports what computes them; what that needs is asked of `missing` first.
+        missing: what keeps it from running as asked; None: it runs everything.
+        max_order: of a stencil; None: any.
+        pulls: whether it has the adjoint to the points in one pass, of stencils below `max_order`.
+    """
+
+    load: Callable[[], Any]
+    missing: Callable[..., str | None] | None = None
+    max_order: int | None = None
+    pulls: bool = False
+
+    @cached_property
+    def sums(self) -> Any:
+        """What computes it, imported at its first use."""
+        return self.load()
+
+    def of(self, stencil: Stencil) -> Sums:
+        """What computes this stencil: the reference where its order is too high."""
+        return reference if self.max_order is not None and stencil.order > self.max_order else self.sums
 
 
-def _implementation(name: str, stencil: Stencil) -> Implementation:
-    return reference if stencil.order > MAX_ORDER.get(name, stencil.order) else IMPLEMENTATIONS[name]
+def _on_the_cpu() -> Any:
+    from filterlab.ops.cpu import gather  # it needs llvmlite
+
+    return gather
+
+
+def _on_a_gpu() -> Any:
+    from filterlab.ops.cuda import gather  # it needs Triton
+
+    return gather
+
+
+IMPLEMENTATIONS: dict[str, Implementation] = {
+    "reference": Implementation(lambda: reference),
+    "cpu": Implementation(_on_the_cpu, cpu.missing, MAX_ORDER, pulls=True),
+    "cuda": Implementation(_on_a_gpu, cuda.missing, MAX_ORDER),
+}
+
+
+def missing(implementation: str, values: Tensor, points: Tensor, stencil: Stencil, *sizes) -> str | None:
+    """What an implementation lacks to gather (or scatter) as asked; None: nothing. See `ops.cpu.missing`."""
+    asked = IMPLEMENTATIONS[implementation].missing
+    return None if asked is None else asked(values, points, stencil, *sizes)
 
 
 def _along_axes(raised: Tensor, stencil: Stencil) -> Tensor:
@@ -52,8 +97,9 @@ def pull(
 ) -> Tensor:
     """The adjoint of gather to its points, (N, M, 3); in one pass where no derivative of it is asked."""
     alone = not transformed() and (not torch.is_grad_enabled() or plain(coefficients, points, cotangents))
-    if implementation == "cpu" and stencil.order < cpu.MAX_ORDER and alone:
-        return cpu.pull(coefficients, points, cotangents, stencil, start)
+    chosen = IMPLEMENTATIONS[implementation]
+    if alone and chosen.pulls and stencil.order < MAX_ORDER:
+        return chosen.sums.pull(coefficients, points, cotangents, stencil, start)
     raised = gather(coefficients, points, stencil.derivatives[0], start, implementation)
     return gradient_to_points(raised, cotangents, stencil)
 
@@ -68,7 +114,7 @@ class Gather(torch.autograd.Function):
 
     @staticmethod
     def forward(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int, implementation: str) -> Tensor:
-        return _implementation(implementation, stencil).gather(coefficients, points, stencil, start)
+        return IMPLEMENTATIONS[implementation].of(stencil).gather(coefficients, points, stencil, start)
 
     @staticmethod
     def setup_context(ctx, inputs, output) -> None:
@@ -123,7 +169,7 @@ class Scatter(torch.autograd.Function):
     def forward(
         cotangents: Tensor, points: Tensor, stencil: Stencil, shape: tuple[int, ...], start: int, implementation: str
     ) -> Tensor:
-        return _implementation(implementation, stencil).scatter(cotangents, points, stencil, shape, start)
+        return IMPLEMENTATIONS[implementation].of(stencil).scatter(cotangents, points, stencil, shape, start)
 
     @staticmethod
     def setup_context(ctx, inputs, output) -> None:
@@ -173,25 +219,13 @@ class Scatter(torch.autograd.Function):
         return out.unflatten(0, (b, p.shape[1])), 0
 
 
-def plain(*tensors: Tensor) -> bool:
-    """True when no derivative of any kind is asked: autograd.Function's own 0.1 ms can be saved."""
-    return not (any(t.requires_grad for t in tensors) or transformed())
-
-
-def transformed() -> bool:
-    """True inside a transform: vmap, jvp and the like, forward mode, torch.compile."""
-    return (
-        torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0 or torch.compiler.is_compiling()
-    )
-
-
 def gather(
     coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0, implementation: str = "reference"
 ) -> Tensor:
     if not stencil.exact:  # tables that are tensors: torch differentiates the sum itself, in them too
         return reference.gather(coefficients, points, stencil, start)
     if plain(coefficients, points):
-        return _implementation(implementation, stencil).gather(coefficients, points, stencil, start)
+        return IMPLEMENTATIONS[implementation].of(stencil).gather(coefficients, points, stencil, start)
     return Gather.apply(coefficients, points, stencil, start, implementation)  # type: ignore[return-value]
 
 
@@ -206,5 +240,5 @@ def scatter(
     if not stencil.exact:
         return reference.scatter(cotangents, points, stencil, shape, start)
     if plain(cotangents, points):
-        return _implementation(implementation, stencil).scatter(cotangents, points, stencil, shape, start)
+        return IMPLEMENTATIONS[implementation].of(stencil).scatter(cotangents, points, stencil, shape, start)
     return Scatter.apply(cotangents, points, stencil, shape, start, implementation)  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""What the march and its adjoint have in common on a GPU: rays, their segments, empty space, and how they are launched.
+"""What the march and its adjoint have in common on a GPU: rays, their segments and empty space.
 
 A program is one warp of BLOCK neighbouring rays, one for each thread, so that no ray waits for those of another warp.
 Its rays are cut into segments exactly as `render.rays.segments` does it, in double precision. While one of them goes
@@ -14,23 +14,15 @@ What no ray of the warp needs is not computed: taps where all of them leap.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Protocol
-
-import torch
-from torch import Tensor
+from typing import Protocol
 
 from filterlab.ops.cuda.optics import Lights, shade
 from filterlab.ops.cuda.source import Source
 from filterlab.ops.cuda.tape import Node, Tape
 from filterlab.ops.cuda.taps import AXES, Taps
 from filterlab.ops.stencil import Lowered
-
-if TYPE_CHECKING:
-    from filterlab.ops.march import March
 
 BLOCK = 32  # rays of a program; a warp
 
@@ -66,7 +58,7 @@ class Recipe(Protocol):
 
 
 def arrays_of(recipe: Recipe) -> tuple[str, ...]:
-    """The first parameters of a program; shapes as in `ops.cpu.march.FIELDS`."""
+    """The first parameters of a program; shapes as in `ops.cpu.compositing.FIELDS`."""
     rays = ("entry", "direction", "length", "offset", "count")
     lit = () if recipe.lights is None else ("shading", "view", "world")
     bricks = ("bricks",) if recipe.skipping else ()
@@ -192,7 +184,7 @@ class Program:
         self.line("passed += tl.where(near, tau, 0.0).to(tl.float64)")
 
     def uniform(self, active: bool) -> dict[str, list[Node]]:
-        """What is the same all along a ray, by name of `ops.derivatives.gradient_columns`; empty when unlit."""
+        """What is the same all along a ray, by name of `ops.march_derivatives.gradient_columns`; empty when unlit."""
         if self.lights is None:
             return {}
         widths = {"shading": 2 + 6 * self.lights, "view": 6 * self.lights}
@@ -220,51 +212,3 @@ def _lights(uniform: dict[str, list[Node]], count: int) -> Lights:
     tints = [shading[2 + 3 * i : 5 + 3 * i] for i in range(2 * count)]
     vectors = [view[3 * i : 3 * i + 3] for i in range(2 * count)]
     return Lights(shading[0], shading[1], vectors[::2], vectors[1::2], tints[::2], tints[1::2])
-
-
-# --- launching --------------------------------------------------------------------------------------------------------
-
-
-def launch(recipe: Recipe, march: March, own: dict[str, Tensor]) -> None:
-    """Run the program for all rays of a march.
-
-    Args:
-        own: the arrays of `recipe.own`; contiguous where they are written.
-    """
-    from filterlab.ops.cuda.launch import interpreting
-
-    arrays = _arrays(march) | own
-    given = [arrays[name].detach().resolve_neg().contiguous() for name in arrays_of(recipe)]
-    rays = march.rays.count.shape[0]
-    with torch.cuda.device_of(given[0]):  # Triton launches on the current device
-        _program(recipe, interpreting())[(-(-rays // BLOCK),)](*given, *_sizes(march), BLOCK=BLOCK, num_warps=1)
-
-
-def _arrays(march: March) -> dict[str, Tensor]:
-    from filterlab.ops.march import _tables
-
-    numbers = (march.step, 1 / march.transfer.unit, march.opaque, march.slack, math.inf)
-    return {
-        "coefficients": march.coefficients,
-        **{name: getattr(march.rays, name) for name in ("entry", "direction", "length", "offset", "count")},
-        **_tables(march.transfer),
-        **(march._lit() if march.lighting else {}),
-        **({"bricks": march.bricks.distance} if march.bricks else {}),
-        "numbers": torch.tensor(numbers, dtype=torch.float64, device=march.coefficients.device),
-    }
-
-
-def _sizes(march: March) -> tuple[int, ...]:
-    """In the order of `SIZES`."""
-    bricks = (0, 0, 0) if march.bricks is None else march.bricks.distance.shape
-    edge = march.bricks.edge if march.bricks else 0
-    inner = max(len(march.transfer.positions) - 2, 0)  # control points between the first and the last
-    shape = march.coefficients.shape
-    return march.rays.count.shape[0], *shape, march.start, inner.bit_length(), inner, bricks[1], bricks[2], edge
-
-
-@lru_cache(maxsize=256)
-def _program(recipe: Recipe, interpreted: bool) -> Any:
-    from filterlab.ops.cuda.launch import launchable
-
-    return launchable(recipe.write())

@@ -9,8 +9,16 @@ from collections.abc import Collection
 
 from torch import Tensor
 
-GRADIENTS = ("coefficients", "rays", "table", "shading")
-"""What the adjoint can compute; rays: entry, direction, length. The march itself has none of them."""
+MEMBERS = {
+    "coefficients": ("coefficients",),
+    "rays": ("entry", "direction", "length"),
+    "table": ("positions", "opacities", "colors"),
+    "shading": ("ambient", "shininess", "diffuse", "specular", "toward", "halfway"),
+}
+"""What the adjoint can compute: groups of derivatives, each with the tensors of `March.tensors` that it is by."""
+
+GRADIENTS = tuple(MEMBERS)
+"""The groups. The march itself has none of them."""
 
 TABLE_ROW = 12
 """Of every interval the derivatives by x₀ x₁ α₀ α₁ r₀ r₁ g₀ g₁ b₀ b₁, and two that mean nothing."""
@@ -40,7 +48,7 @@ def columns_of_rays(lights: int | None) -> int:
 def by_name(
     gradients: Collection[str], volume: Tensor | None, by_ray: Tensor, table: Tensor, points: int, lights: int | None
 ) -> dict[str, Tensor]:
-    """What `March.adjoint` returns.
+    """What the adjoint of a march returns.
 
     Args:
         gradients: what was asked.

@@ -16,8 +16,9 @@ from torch import Tensor
 from torch.library import custom_op
 
 from filterlab.kernels import Kernel
-from filterlab.ops import autograd, placement
-from filterlab.ops.placement import Placement
+from filterlab.ops.differentiable import gather as sums
+from filterlab.ops.differentiable import place as placement
+from filterlab.ops.place import Placement
 from filterlab.ops.stencil import Product, Stencil
 from filterlab.volume import Boundary, Geometry
 
@@ -66,7 +67,7 @@ def placement_of(text: str) -> Placement:
 @custom_op("filterlab::gather", mutates_args=())
 def gather(coefficients: Tensor, points: Tensor, stencil: str, start: int, implementation: str) -> Tensor:
     """`ops.gather` of a stencil given as text."""
-    return autograd.gather(coefficients, points, stencil_of(stencil), start, implementation).contiguous()
+    return sums.gather(coefficients, points, stencil_of(stencil), start, implementation).contiguous()
 
 
 @gather.register_fake
@@ -96,7 +97,7 @@ def _gather_backward(ctx, cotangents: Tensor):
 def _to_points(coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: str, *rest) -> Tensor:
     own = stencil_of(stencil)
     raised = gather(coefficients, points, stencil_text(own.derivatives[0]), *rest)
-    return autograd.gradient_to_points(raised, cotangents, own)
+    return sums.gradient_to_points(raised, cotangents, own)
 
 
 gather.register_autograd(_gather_backward, setup_context=_keep_gather)
@@ -110,7 +111,7 @@ def scatter(
     cotangents: Tensor, points: Tensor, stencil: str, shape: list[int], start: int, implementation: str
 ) -> Tensor:
     """`ops.scatter` of a stencil given as text."""
-    out = autograd.scatter(cotangents, points, stencil_of(stencil), tuple(shape), start, implementation)
+    out = sums.scatter(cotangents, points, stencil_of(stencil), tuple(shape), start, implementation)
     return out.contiguous()
 
 

@@ -1,0 +1,242 @@
+"""gather, scatter and pull as vector code: describes the arrays to the programs of `ops.cpu.points`, and runs them.
+
+Same meaning as `ops.reference.gather`, orders 0 … 3. Coefficients are read as they are stored, sums are in the points'
+dtype. The result of gather does not depend on the number of threads, bit by bit; that of scatter only on their number.
+Points that lie all over a large volume are sorted first (`order`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from filterlab.ops.cpu import compiler, order
+from filterlab.ops.cpu import threads as pool
+from filterlab.ops.cpu.job import AXES, Job
+from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, lanes_of, threads_for
+from filterlab.ops.cpu.memory import ARITHMETIC, fresh, zeros
+from filterlab.ops.cpu.order import Sorted
+from filterlab.ops.cpu.points import BLOCK, Recipe
+from filterlab.ops.gather import STORAGE, readable
+from filterlab.ops.stencil import Stencil
+
+FEWEST_SORTED = 1 << 16  # points of a batch entry
+SMALLEST_SORTED_IN = 16 << 20  # bytes of one channel
+SPLAT_MEMORY = 1 << 30  # bytes that scatter may take for partial results beyond the result itself
+
+_POINTS_PER_THREAD = 4096  # fewer are not worth waking a thread for
+
+
+def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
+    """`ops.reference.gather.gather`, fused."""
+    return Gathering(coefficients, stencil, start, points.dtype)(points)
+
+
+class Gathering:
+    """Rows of a stencil at points, of given coefficients: what no point changes is settled once.
+
+    Args:
+        coefficients: (N, C, D, H, W). Nothing is copied but what is not contiguous within a channel.
+        stencil, start: as for `gather`.
+        dtype: of the points.
+    """
+
+    def __init__(self, coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dtype) -> None:
+        self.coefficients = readable(coefficients, 2)
+        self.channels, self.rows, self.start = coefficients.shape[1], len(stencil.rows), start
+        self.dtype, self.program = dtype, Program.of("gather", self.coefficients, stencil, start, dtype)
+        self.bytes_of_channel = math.prod(coefficients.shape[2:]) * coefficients.element_size()
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """(N, M, 3) -> (N, C, J, M)."""
+        entries, count = points.shape[:2]
+        out = fresh((entries, self.channels, self.rows, count), self.dtype)
+        if out.numel() == 0:
+            return out
+        points = readable(points, 1)
+        if _sorting_pays(points, self.bytes_of_channel):
+            self._sorted(points, out)
+        else:
+            self.program.share(self.coefficients, points, out)
+        return out
+
+    def _sorted(self, points: Tensor, out: Tensor) -> None:
+        for entry, part, ordered in _in_order(points, self.coefficients.shape, self.start):
+            rows = fresh((1, self.channels, self.rows, ordered.count), self.dtype)
+            self.program.share(self.coefficients[entry : entry + 1], ordered.points[None], rows)
+            for channel in range(self.channels):
+                ordered.restore(rows[0, channel], out[entry, channel, :, part])
+
+
+def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int], start: int = 0) -> Tensor:
+    """`ops.reference.gather.scatter`, fused.
+
+    Each thread takes an equal share of the points and adds into a partial result of its own; these are summed at the
+    end, in order. Partial results take at most `SPLAT_MEMORY` beyond the result itself: fewer threads work when the
+    volume is large, and when there are so few points that adding up would take longer than what is gained.
+    """
+    n, c = cotangents.shape[:2]
+    volume = n * c * shape[0] * shape[1] * shape[2]
+    parts = min(_threads(points), 1 + SPLAT_MEMORY // (volume * points.element_size() or 1))
+    parts = max(1, min(parts, 8 * n * c * points.shape[1] // (volume or 1)))
+    out = zeros((n, c, *shape), points.dtype)
+    if not (cotangents.numel() and volume):
+        return out
+    more = [zeros(out.shape, out.dtype) for _ in range(parts - 1)]
+    cotangents, points = readable(cotangents.to(points.dtype), 0), readable(points, 1)
+    program = Program.of("scatter", out, stencil, start, points.dtype)
+    if not _sorting_pays(points, math.prod(shape) * points.element_size()):
+        program.divide([out, *more], points, cotangents)
+    else:
+        for entry, part, ordered in _in_order(points, out.shape, start):
+            rows = _arranged(ordered, cotangents[entry, :, :, part])
+            own = [volume[entry : entry + 1] for volume in (out, *more)]
+            program.divide(own, ordered.points[None], rows)
+    for part in more:
+        out += part
+    return out.contiguous()
+
+
+def pull(coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
+    """The adjoint of gather to its points, (N, M, 3): Σ over channels and rows of cotangent · gradient of the row."""
+    if cotangents.numel() == 0 or points.numel() == 0:
+        return torch.zeros_like(points)
+    coefficients, points = readable(coefficients, 2), readable(points, 1)
+    cotangents = readable(cotangents.to(points.dtype), 0)
+    derivatives, raised = stencil.derivatives
+    program = Program.of("pull", coefficients, derivatives, start, points.dtype, raised)
+    out = fresh(points.shape, points.dtype)
+    if not _sorting_pays(points, math.prod(coefficients.shape[2:]) * coefficients.element_size()):
+        program.share(coefficients, points, cotangents, out)
+        return out
+    for entry, part, ordered in _in_order(points, coefficients.shape, start):
+        rows = _arranged(ordered, cotangents[entry, :, :, part])
+        own = fresh((1, ordered.count, 3), points.dtype)
+        program.share(coefficients[entry : entry + 1], ordered.points[None], rows, own)
+        back = fresh((3, ordered.count), points.dtype)
+        ordered.restore(own[0].T.contiguous(), back)
+        out[entry, part] = back.T
+    return out
+
+
+def _arranged(ordered: Sorted, cotangents: Tensor) -> Tensor:
+    """Cotangents (C, J, M) in the order of sorted points, (1, C, J, M)."""
+    rows = fresh((1, *cotangents.shape), cotangents.dtype)
+    for channel, own in enumerate(cotangents):
+        ordered.arrange(own, rows[0, channel])
+    return rows
+
+
+def _sorting_pays(points: Tensor, bytes_of_channel: int) -> bool:
+    """Whether sorting points (N, M, 3) costs less than it saves (`order`)."""
+    return points.shape[1] >= FEWEST_SORTED and bytes_of_channel >= SMALLEST_SORTED_IN and order.scattered(points)
+
+
+def _in_order(points: Tensor, shape: Sequence[int], start: int) -> Iterator[tuple[int, slice, Sorted]]:
+    """(batch entry, which of its points, those points sorted), part by part, so that copies stay bounded."""
+    count = points.shape[1]
+    parts = -(-count // order.POINTS_AT_ONCE)
+    for entry, own in enumerate(points):
+        for i in range(parts):
+            part = slice(count * i // parts, count * (i + 1) // parts)
+            yield entry, part, Sorted(own[part], (shape[2], shape[3], shape[4]), start, lanes_of(points.dtype))
+
+
+@dataclass(frozen=True)
+class Program:
+    """A compiled program, and its job as far as coefficients and stencil decide it.
+
+    Attributes:
+        run: the machine code.
+        job: with everything but addresses and what the number of points decides.
+        lanes: P.
+    """
+
+    run: Callable[[int], None]
+    job: Job
+    lanes: int
+
+    @classmethod
+    def of(
+        cls,
+        operation: str,
+        volume: Tensor,
+        stencil: Stencil,
+        start: int,
+        dtype: torch.dtype,
+        raised: tuple[tuple[int, ...], ...] = (),
+    ) -> Program:
+        """Compiled, or found.
+
+        Args:
+            operation: "gather", "scatter" or "pull".
+            volume: (N, C, D, H, W) or like it: coefficients, or what is added to.
+            stencil, start: as for `gather`; for pull the derivatives of what was gathered.
+            dtype: of points and sums.
+            raised: for pull, as in `Stencil.derivatives`.
+        """
+        lanes = lanes_of(dtype)
+        recipe = Recipe(operation, stencil.lowered, ARITHMETIC[dtype], STORAGE[volume.dtype], lanes, raised)
+        d, h, w = volume.shape[2:]
+        job = Job(
+            channels=volume.shape[1],
+            width=w,
+            height=h,
+            start=start,
+            coefficients_entry=volume.stride(0),
+            coefficients_channel=volume.stride(1),
+        )
+        for axis, size, support in zip(AXES, (w, h, d), stencil.supports, strict=True):
+            setattr(job, f"low_{axis}", start)
+            setattr(job, f"high_{axis}", start + size - support)
+        return cls(compiler.compiled(recipe), job, lanes)
+
+    def share(self, coefficients: Tensor, points: Tensor, rows: Tensor, gradient: Tensor | None = None) -> None:
+        """gather or pull: all threads share the points, chunk by chunk.
+
+        Args:
+            points: (N, M, 3).
+            rows: (N, C, J, M), contiguous; written by gather, read by pull.
+            gradient: (N, M, 3), written by pull.
+        """
+        threads = _threads(points)
+        job, _ = self._described(points, rows, threads * CHUNKS_PER_THREAD if threads > 1 else 1)
+        job.coefficients = coefficients.data_ptr()
+        if gradient is not None:
+            job.gradient = gradient.data_ptr()
+        pool.run(self.run, [job] * threads)
+
+    def divide(self, volumes: Sequence[Tensor], points: Tensor, rows: Tensor) -> None:
+        """scatter: a thread for each of `volumes` (as of `memory.zeros`), with an equal share of the points."""
+        job, parts = self._described(points, rows, len(volumes))
+        pool.run(self.run, [_own_share(job, i, volume) for i, volume in enumerate(volumes[:parts])])
+
+    def _described(self, points: Tensor, rows: Tensor, parts: int) -> tuple[Job, int]:
+        """The job of these points, cut into so many parts or a little fewer; and how many."""
+        entries, count = points.shape[:2]
+        job = Job.from_buffer_copy(self.job)
+        packs = -(-count // self.lanes)
+        blocks = -(-packs // BLOCK)
+        chunk = -(-blocks // parts) * BLOCK
+        parts = -(-packs // chunk)
+        job.points, job.rows = points.data_ptr(), rows.data_ptr()
+        assert all((job.points, job.rows)), "tensors without memory"
+        job.count, job.entries, job.points_entry = count, entries, points.stride(0)
+        job.chunk, job.chunks = chunk, parts * entries
+        return job, parts
+
+
+def _own_share(job: Job, part: int, volume: Tensor) -> Job:
+    """The job of adding one part of every batch entry's points to a volume of its own."""
+    own = Job.from_buffer_copy(job)
+    own.coefficients = volume.data_ptr()
+    own.next, own.chunks = part * job.entries, (part + 1) * job.entries
+    return own
+
+
+def _threads(points: Tensor) -> int:
+    return threads_for(points.shape[0] * points.shape[1], _POINTS_PER_THREAD)

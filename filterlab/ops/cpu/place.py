@@ -1,0 +1,85 @@
+"""place as vector code: describes the arrays to the program of `ops.cpu.folding`, and runs it."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from filterlab.ops.cpu import compiler
+from filterlab.ops.cpu import threads as pool
+from filterlab.ops.cpu.folding import Job, Recipe
+from filterlab.ops.cpu.job import AXES
+from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, lanes_of, threads_for
+from filterlab.ops.cpu.memory import ARITHMETIC, fresh
+from filterlab.ops.gather import readable
+from filterlab.ops.place import Placed, Placement
+from filterlab.volume import Boundary
+
+_POINTS_PER_THREAD = 4096  # fewer are not worth waking a thread for
+
+
+def place(points: Tensor, placement: Placement) -> Placed:
+    """`ops.place`, fused: (located, sign); sign None where it is 1 everywhere."""
+    return Placing(placement, points.dtype)(points)
+
+
+class Placing:
+    """Points of one dtype to where a placement tells: what no point changes is settled once."""
+
+    def __init__(self, placement: Placement, dtype: torch.dtype) -> None:
+        self.dtype, self.lanes = dtype, lanes_of(dtype)
+        self.placement = placement
+        self.job = _job(placement)
+        self.run = self._program(signs=False)
+
+    def _program(self, signs: bool) -> Callable[[int], None]:
+        geometry, boundary = self.placement.geometry, self.placement.boundary
+        x, y, z = (_how_it_folds(boundary, n) for n in self.placement.size)
+        affine = "identity" if geometry.is_identity else "full" if geometry.diagonal is None else "diagonal"
+        return compiler.compiled(Recipe((x, y, z), affine, signs, ARITHMETIC[self.dtype], self.lanes))
+
+    def __call__(self, points: Tensor) -> Placed:
+        """(..., 3) to (located, sign)."""
+        located = fresh(points.shape, self.dtype)
+        if points.numel() == 0:
+            return located, None
+        points = readable(points, 0)
+        count = points.numel() // 3
+        threads = threads_for(count, _POINTS_PER_THREAD)
+        packs = -(-count // self.lanes)
+        chunk = -(-packs // (threads * CHUNKS_PER_THREAD if threads > 1 else 1))
+        chunks = -(-packs // chunk)
+        turned = (ctypes.c_int64 * chunks)()
+        job = Job.from_buffer_copy(self.job)
+        job.points, job.located, job.turned = points.data_ptr(), located.data_ptr(), ctypes.addressof(turned)
+        job.count, job.chunk, job.chunks = count, chunk, chunks
+        pool.run(self.run, [job] * threads)
+        if not any(turned):
+            return located, None
+        sign = fresh(points.shape, self.dtype)
+        job.signs, job.next = sign.data_ptr(), 0
+        pool.run(self._program(signs=True), [job] * threads)
+        return located, sign
+
+
+def _job(placement: Placement) -> Job:
+    """With everything but addresses and what the number of points decides."""
+    geometry = placement.geometry
+    job = Job(shift=placement.shift)
+    for i, (a, n) in enumerate(zip(AXES, placement.size, strict=True)):
+        setattr(job, f"origin_{a}", geometry.origin[i])
+        low, high = placement.boundary.interval(n, placement.tail)
+        setattr(job, f"low_{a}", low)
+        setattr(job, f"high_{a}", high)
+        for j, b in enumerate(AXES):
+            setattr(job, f"matrix_{a}{b}", geometry.inverse[i][j])
+    return job
+
+
+def _how_it_folds(boundary: Boundary, n: int) -> str:
+    if boundary is Boundary.MIRROR and n == 1:
+        return "flat"
+    return {Boundary.MIRROR: "reflect", Boundary.REFLECT: "reflect", Boundary.WRAP: "wrap"}.get(boundary, "clamp")

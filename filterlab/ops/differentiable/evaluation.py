@@ -1,0 +1,68 @@
+"""What a field does with points: place, then gather. What no point changes is settled when the field is built."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from filterlab.ops.differentiable import operators
+from filterlab.ops.differentiable.gather import gather
+from filterlab.ops.differentiable.place import place
+from filterlab.ops.differentiable.recording import plain
+from filterlab.ops.place import Placed, Placement
+from filterlab.ops.stencil import Stencil
+
+Prepared = Callable[[Tensor], Placed]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Rows of a stencil at world points: `ops.place`, then `ops.gather`, in one descent where nothing is recorded.
+
+    Nothing is checked here: whoever builds it knows that the implementation can run as asked, and gives points of a
+    right type and shape.
+
+    Attributes:
+        coefficients: (N, C, D, H, W).
+        placement, stencil, start: as for `ops.place` and `ops.gather`.
+        implementation: a key of `ops.IMPLEMENTATIONS`.
+    """
+
+    coefficients: Tensor
+    placement: Placement
+    stencil: Stencil
+    start: int
+    implementation: str
+    _prepared: dict[torch.dtype, Prepared] = field(default_factory=dict, repr=False)
+
+    def __call__(self, points: Tensor) -> Placed:
+        """(N, M, 3) -> rows (N, C, J, M), and the sign (N, M, 3) of `ops.place` or None."""
+        if torch.compiler.is_compiling():
+            return self._compiled(points)
+        if self.implementation == "cpu" and plain(self.coefficients, points):
+            return self._of(points)(points)
+        located, sign = place(points, self.placement, self.implementation)
+        return gather(self.coefficients, located, self.stencil, self.start, self.implementation), sign
+
+    def _of(self, points: Tensor) -> Prepared:
+        found = self._prepared.get(points.dtype)
+        if found is None:
+            from filterlab.ops.cpu.evaluation import Evaluator  # it needs llvmlite
+
+            parts = (self.coefficients, self.placement, self.stencil, self.start)
+            found = self._prepared[points.dtype] = Evaluator(*parts, points)
+        return found
+
+    def _compiled(self, points: Tensor) -> Placed:
+        """By operators of `torch.library`."""
+        located, sign = operators.place(points, operators.placement_text(self.placement), self.implementation)
+        text = operators.stencil_text(self.stencil)
+        return operators.gather(self.coefficients, located, text, self.start, self.implementation), sign
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Machine code stays behind in a copy."""
+        return {**vars(self), "_prepared": {}}

@@ -1,0 +1,38 @@
+"""place, described: world points to coordinates of stored coefficients.
+
+Coefficients are stored padded under a boundary, so that no tap is ever folded; the points are, into the stored part:
+
+    located = fold(matrix · (point − origin)) − shift,       sign = d fold / d voxel ∈ {1, −1, 0} along each axis,
+
+and d located_i / d point_j = sign_i · matrix_ij.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from filterlab.volume import Boundary, Geometry
+
+Placed = tuple[Tensor, Tensor | None]
+"""(located, sign), both of the shape of the points; sign None where it is 1 everywhere."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where points belong.
+
+    Attributes:
+        geometry: voxel -> world.
+        boundary: the extension of the samples.
+        size: voxels along x, y, z.
+        tail: how far beyond the ends points are told apart (border and zeros).
+        shift: what is subtracted in the end: ½ for coefficients at half-integers.
+    """
+
+    geometry: Geometry
+    boundary: Boundary
+    size: tuple[int, int, int]
+    tail: int = 0
+    shift: float = 0.0
