@@ -12,9 +12,10 @@ rows are the rows of another one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import groupby
 
 import torch
 
@@ -149,6 +150,21 @@ class Lowered:
     def has(self, axis: int, function: int, tap: int) -> bool:
         """Whether that function has a weight for that tap at all."""
         return any(self.functions[axis][function][tap])
+
+    def runs(self) -> list[tuple[range, tuple[int, ...]]]:
+        """Runs of planes for which the same functions along z have a weight, with those functions."""
+        functions = range(len(self.functions[2]))
+        live = [tuple(c for c in functions if self.has(2, c, z)) for z in range(self.supports[2])]
+        runs = [(key, [z for z, _ in group]) for key, group in groupby(enumerate(live), key=lambda item: item[1])]
+        return [(range(planes[0], planes[-1] + 1), key) for key, planes in runs if key]
+
+    def pairs(self, functions: Collection[int]) -> list[tuple[int, int]]:
+        """The distinct (a, b), functions along x and y, of products that have one of these functions along z."""
+        return list(dict.fromkeys((a, b) for row in self.rows for _, a, b, c in row if c in functions))
+
+    def taps(self, functions: Collection[int]) -> list[int]:
+        """The taps along x that one of the functions has a weight for."""
+        return [x for x in range(self.supports[0]) if any(self.has(0, a, x) for a in functions)]
 
 
 def per_axis(kernels: PiecewisePolynomial | Sequence[PiecewisePolynomial]) -> Kernels:

@@ -42,7 +42,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from itertools import groupby
 from types import SimpleNamespace
 
 from filterlab.ops.cpu.lanes import I32, I64, Lanes, Storage, Value
@@ -205,7 +204,7 @@ class Taps:
         for planes in self._alike(apart=self.written_out):
             with self._every(planes, here) as (plane_offset, wz):
                 sums: dict[tuple[int, int], Value] = {}
-                pairs = self._pairs(wz)
+                pairs = self.stencil.pairs(wz)
                 for y, line in self._fetch_lines(taps, plane_offset, self._needed(pairs)):
                     self._contract_line(y, line, weights, pairs, sums)
                 for row, products in zip(rows, self.stencil.rows, strict=True):
@@ -288,25 +287,15 @@ class Taps:
 
     def _alike(self, apart: bool = False) -> list[tuple[range, tuple[int, ...]]]:
         """Runs of planes (or planes apart) with the same functions that have a weight along z; and those functions."""
-        functions = range(len(self.stencil.functions[2]))
-        live = [tuple(c for c in functions if self.stencil.has(2, c, z)) for z in range(self.supports[2])]
-        runs = [(key, [z for z, _ in group]) for key, group in groupby(enumerate(live), key=lambda item: item[1])]
-        found = [(range(planes[0], planes[-1] + 1), key) for key, planes in runs if key]
+        found = self.stencil.runs()
         return [(range(z, z + 1), key) for planes, key in found for z in planes] if apart else found
 
-    def _pairs(self, wz: dict[int, Value]) -> list[tuple[int, int]]:
-        """The distinct (a, b) of products that have one of these functions along z."""
-        return list(dict.fromkeys((a, b) for row in self.stencil.rows for _, a, b, c in row if c in wz))
-
     def _needed(self, pairs: list[tuple[int, int]]) -> dict[int, range]:
-        """The lines y of a plane that products with these (a, b) read, and which of their taps."""
-        lines = {y: self._taps_of({a for a, b in pairs if self.stencil.has(1, b, y)}) for y in range(self.supports[1])}
-        return {y: taps for y, taps in lines.items() if taps}
-
-    def _taps_of(self, functions: set[int]) -> range:
-        """From the first to the last tap along x that one of the functions has a weight for."""
-        taps = [x for x in range(self.supports[0]) if any(self.stencil.has(0, a, x) for a in functions)]
-        return range(taps[0], taps[-1] + 1) if taps else range(0)
+        """The lines y of a plane that products with these (a, b) read, and which of their taps: first to last."""
+        lines = {
+            y: self.stencil.taps({a for a, b in pairs if self.stencil.has(1, b, y)}) for y in range(self.supports[1])
+        }
+        return {y: range(taps[0], taps[-1] + 1) for y, taps in lines.items() if taps}
 
     @contextmanager
     def _every(self, planes: tuple[range, tuple[int, ...]], here: Value) -> Iterator[tuple[Value, dict[int, Value]]]:

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import groupby
 
 from filterlab.ops.cuda.source import Source, number, polynomial
 from filterlab.ops.stencil import Lowered
@@ -96,7 +95,7 @@ class Taps:
         z, wz = plane
         sums = _Sums(self.source)
         for y in range(self.stencil.supports[1]):
-            self._contract_line(f"{tap} + ({z} * height + {y}) * width", y, self._pairs(wz), sums)
+            self._contract_line(f"{tap} + ({z} * height + {y}) * width", y, self.stencil.pairs(wz), sums)
         for r, products in enumerate(self.stencil.rows):
             for c, weight in wz.items():
                 own = [(factor, f"plane_{a}_{b}") for factor, a, b, function in products if function == c]
@@ -106,7 +105,7 @@ class Taps:
     def _contract_line(self, at: str, y: int, pairs: Iterable[tuple[int, int]], planes: _Sums) -> None:
         """Add line y to the sums over a plane."""
         pairs = [(a, b) for a, b in pairs if self.stencil.has(1, b, y)]
-        needed = self._taps_of({a for a, _ in pairs})
+        needed = self.stencil.taps({a for a, _ in pairs})
         if not needed:
             return
         self.source.line(f"at = {at}")
@@ -114,7 +113,7 @@ class Taps:
             self.source.line(f"tap_{x} = tl.load(at + {x}).to(arithmetic)")
         lines = _Sums(self.source)
         for a in dict.fromkeys(a for a, _ in pairs):
-            for x in self._taps_of({a}):
+            for x in self.stencil.taps({a}):
                 lines.add(f"line_{a}", f"{self._weight(0, a, x)} * tap_{x}")
         for a, b in pairs:
             if f"line_{a}" in lines:
@@ -140,11 +139,11 @@ class Taps:
     def _spread_line(self, at: str, y: int, planes: _Sums, mask: str) -> None:
         """Line y of a plane. Several points may share a coefficient: the additions are atomic."""
         lines = _Sums(self.source)
-        for a, b in self._pairs(range(len(self.stencil.functions[2]))):
+        for a, b in self.stencil.pairs(range(len(self.stencil.functions[2]))):
             if self.stencil.has(1, b, y) and f"plane_{a}_{b}" in planes:
                 lines.add(f"line_{a}", f"{self._weight(1, b, y)} * plane_{a}_{b}")
         functions = [a for a in range(len(self.stencil.functions[0])) if f"line_{a}" in lines]
-        if needed := self._taps_of(functions):
+        if needed := self.stencil.taps(functions):
             self.source.line(f"into = {at}")
         values = _Sums(self.source)
         for x in needed:
@@ -155,16 +154,9 @@ class Taps:
 
     # --- which taps there are ---
 
-    def _runs(self) -> list[tuple[range, tuple[int, ...]]]:
-        """Runs of planes for which the same functions along z have a weight, with those functions."""
-        functions = range(len(self.stencil.functions[2]))
-        live = [tuple(c for c in functions if self.stencil.has(2, c, z)) for z in range(self.stencil.supports[2])]
-        runs = [(key, [z for z, _ in group]) for key, group in groupby(enumerate(live), key=lambda item: item[1])]
-        return [(range(planes[0], planes[-1] + 1), key) for key, planes in runs if key]
-
     def _planes(self) -> Iterator[Plane]:
         """Every plane of taps; in a large stencil every run of planes, within a loop over it."""
-        for run, functions in self._runs():
+        for run, functions in self.stencil.runs():
             if self.written_out:
                 for z in run:
                     yield str(z), {c: self._weight(2, c, z) for c in functions}
@@ -180,15 +172,6 @@ class Taps:
         for z in reversed(planes[:-1]):
             text = f"tl.where(plane == {z}, {_typed(self._weight(2, function, z))}, {text})"
         return text
-
-    def _pairs(self, functions: Iterable[int]) -> list[tuple[int, int]]:
-        """The distinct (a, b) of products that have one of these functions along z."""
-        return list(dict.fromkeys((a, b) for row in self.stencil.rows for _, a, b, c in row if c in functions))
-
-    def _taps_of(self, functions: Iterable[int]) -> list[int]:
-        """The taps along x that one of the functions has a weight for."""
-        functions = list(functions)
-        return [x for x in range(self.stencil.supports[0]) if any(self.stencil.has(0, a, x) for a in functions)]
 
 
 class _Sums:
