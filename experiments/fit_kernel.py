@@ -35,6 +35,7 @@ from experiments.members import (
 from experiments.runs import Record, Run, Unit
 from filterlab import prefilters
 from filterlab.io.config import ConfigError, Problem
+from filterlab.methods import tensor_product
 from filterlab.render.scene import Positive
 from filterlab.spectrum import kernel_response
 
@@ -195,7 +196,8 @@ def _named(config: Config, index: int, run: Run) -> Record:
 
 def _facts(recipe: Recipe) -> Record:
     """What the prefilter of a named method costs, and the measures of the whole, where it is separable."""
-    method = fl.METHODS[recipe.method]
+    if (method := tensor_product(recipe.method)) is None:
+        return {}
     used = method.prefilter if recipe.prefilter else prefilters.IDENTITY
     measures = fir.measures(method.kernel, used.response) if method.terms is None else {}
     return {"poles": len(used.poles), "multiplications": fir.multiplications(used), **measures}
@@ -272,8 +274,8 @@ def _spectrum(config: Config, index: int, run: Run) -> Record:
                 curves.append({"taps": choice["taps"], "candidate": fit["candidate"], "repetition": fit["repetition"]})
                 rows.append(_learned_curves(config, fit, omega))
         for against in choice["against"]:
-            method = fl.METHODS[against["recipe"].partition("+")[0]]
-            if against["equal_cost"] and method.terms is None:
+            method = tensor_product(against["recipe"].partition("+")[0])
+            if against["equal_cost"] and method is not None and method.terms is None:
                 recipe = next(r for r in config.methods if r.key == against["recipe"])
                 prefiltering = method.prefilter.response(omega) if recipe.prefilter else torch.ones_like(omega)
                 curves.append({"taps": choice["taps"], **recipe.record()})

@@ -8,7 +8,7 @@ is 1 below the Nyquist frequency π and 0 above.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
 import torch
@@ -18,6 +18,7 @@ from experiments.config import ExperimentConfig, Recipe, Recipes, number
 from experiments.runs import Record, Run, Unit
 from filterlab import spectrum
 from filterlab.io.config import StrictModel
+from filterlab.methods import tensor_product
 
 
 class FigureChoice(StrictModel):
@@ -68,34 +69,41 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
     recipe = next(r for r in config.methods if r.key == unit.key)
     closed_at = torch.linspace(0, config.upper * math.pi, config.samples, dtype=torch.float64, device=config.device)
     measured_at = torch.linspace(0, config.upper * math.pi, config.markers, dtype=torch.float64, device=config.device)
-    closed = spectrum.axis_response(recipe.method, closed_at, prefilter=recipe.prefilter)
     measured = _measured(recipe, measured_at)
-    expected = spectrum.axis_response(recipe.method, measured_at, prefilter=recipe.prefilter)
     files = {
         "omega": run.save_array(f"{recipe.key}-omega", closed_at),
-        "closed": run.save_array(f"{recipe.key}-closed", closed),
         "measured_omega": run.save_array(f"{recipe.key}-measured-omega", measured_at),
         "measured": run.save_array(f"{recipe.key}-measured", measured),
     }
+    found = {"at_nyquist": number(_measured(recipe, closed_at.new_tensor([math.pi]))[0]), "largest_difference": None}
+    if tensor_product(recipe.method) is not None:
+        files["closed"] = run.save_array(f"{recipe.key}-closed", _closed(recipe, closed_at))
+        found["at_nyquist"] = number(_closed(recipe, closed_at.new_tensor([math.pi]))[0])
+        found["largest_difference"] = number((measured - _closed(recipe, measured_at)).abs().max())
     return {
         **recipe.record(),
         **files,
         "files": list(files.values()),
-        "largest_difference": number((measured - expected).abs().max()),
-        "at_nyquist": number(
-            spectrum.axis_response(recipe.method, closed_at.new_tensor([math.pi]), prefilter=recipe.prefilter)[0]
-        ),
-        **{f"{name}_{d}d": number(measure) for name, d, measure in _measures(recipe, config.dimensions)},
+        **found,
+        **{f"{name}_{d}d": measure for name, d, measure in _measures(recipe, config.dimensions)},
     }
+
+
+def _closed(recipe: Recipe, omega: torch.Tensor) -> torch.Tensor:
+    return spectrum.axis_response(recipe.method, omega, prefilter=recipe.prefilter)
 
 
 def _measured(recipe: Recipe, omega: torch.Tensor) -> torch.Tensor:
     return spectrum.measured_response(recipe.method, omega, prefilter=recipe.prefilter, scheme=recipe.scheme)
 
 
-def _measures(recipe: Recipe, dimensions: Sequence[int]) -> list[tuple[str, int, float]]:
-    return [
-        (name, d, float(measure(recipe.method, prefilter=recipe.prefilter, dimensions=d)))
-        for name, measure in (("smoothing", spectrum.smoothing), ("postaliasing", spectrum.postaliasing))
-        for d in dimensions
-    ]
+def _measures(recipe: Recipe, dimensions: Sequence[int]) -> list[tuple[str, int, float | None]]:
+    """Smoothing and postaliasing; None of a method whose response is measured only."""
+
+    def measured(measure: Callable[..., float], d: int) -> float | None:
+        if tensor_product(recipe.method) is None:
+            return None
+        return number(measure(recipe.method, prefilter=recipe.prefilter, dimensions=d))
+
+    measures = (("smoothing", spectrum.smoothing), ("postaliasing", spectrum.postaliasing))
+    return [(name, d, measured(measure, d)) for name, measure in measures for d in dimensions]

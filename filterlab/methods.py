@@ -1,10 +1,13 @@
-"""Methods: named recipes that turn a Volume into a Field. A method is data: a kernel, a prefilter, schemes, facts.
+"""Methods: named ways to turn a Volume into a Field. A method is facts, and how to build the field.
 
-To add one, add an entry to `METHODS`; the tests, the experiments and the command line read it from there.
+`TensorProduct`, a prefilter and a kernel along every axis, is one kind; what only it has (separable terms, a response
+in closed form) callers ask of `tensor_product`, and do without where it answers None. To add a method, add an entry to
+`METHODS`; the tests, the experiments and the command line read it from there.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -64,12 +67,78 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class Method:
-    """Prefilter + kernel + ways to evaluate the sum.
+class Method(ABC):
+    """Facts, and how to build a field.
 
     Attributes:
         name: as in the registry.
         summary: one line for people.
+    """
+
+    name: str
+    summary: str
+
+    @property
+    @abstractmethod
+    def facts(self) -> Facts:
+        """What the method promises."""
+
+    @property
+    @abstractmethod
+    def gradients(self) -> tuple[str, ...]:
+        """Kinds of gradient offered, the default first."""
+
+    @property
+    @abstractmethod
+    def schemes(self) -> tuple[str, ...]:
+        """The ways of evaluating it; the first one that can run is the default."""
+
+    @abstractmethod
+    def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> Scheme:
+        """The scheme of that name with that kind of gradient (None: the first one of either).
+
+        Raises ValueError for a name or a combination that the method does not offer, with those it does.
+        """
+
+    @abstractmethod
+    def reach(self, prefilter: bool) -> int:
+        """How far from a sample, in voxels, the field depends on it in float64."""
+
+    @abstractmethod
+    def build(self, volume: Volume, asked: Asked) -> Field:
+        """The field; see `reconstruct`. Raises ValueError for what the method does not offer."""
+
+    def _check_offered(self, scheme: str | None, gradient: str | None) -> None:
+        if scheme not in (None, *self.schemes):
+            raise ValueError(f"method {self.name} offers the schemes {', '.join(self.schemes)}; got {scheme!r}")
+        if gradient not in (None, *self.gradients):
+            raise ValueError(f"method {self.name} offers the gradients {', '.join(self.gradients)}; got {gradient!r}")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """How a field is to be built; see `reconstruct`.
+
+    Attributes:
+        samples, unknown: the volume's without those that are missing, and a mask of these or None.
+        boundary, prefilter, scheme, gradient, sampler, storage: as for `reconstruct`.
+    """
+
+    samples: Tensor
+    unknown: Tensor | None = None
+    boundary: Boundary = Boundary.MIRROR
+    prefilter: bool = True
+    scheme: str | None = None
+    gradient: str | None = None
+    sampler: str | Sampler = "exact"
+    storage: str | torch.dtype | None = None
+
+
+@dataclass(frozen=True)
+class TensorProduct(Method):
+    """Prefilter + kernel along every axis + ways to evaluate the sum.
+
+    Attributes:
         kernel: φ. For ncrsi, whose 3-D kernel is not separable, the 1-D kernel on grid lines.
         prefilter: samples to coefficients.
         gradients: kinds of gradient offered, the default first.
@@ -80,8 +149,6 @@ class Method:
         taps: coefficients one value needs, when it is not the evaluated kernel's support cubed.
     """
 
-    name: str
-    summary: str
     kernel: PiecewisePolynomial
     prefilter: Prefilter = prefilters.IDENTITY
     gradients: tuple[str, ...] = ("analytic",)
@@ -128,14 +195,7 @@ class Method:
         return ("fused", "direct") if self.sampled is None else ("fused", "direct", "eight_trilinear")
 
     def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> Scheme:
-        """The scheme of that name with that kind of gradient (None: the first one of either).
-
-        Raises ValueError for a name or a combination that the method does not offer, with those it does.
-        """
-        if name not in (None, *self.schemes):
-            raise ValueError(f"method {self.name} offers the schemes {', '.join(self.schemes)}; got {name!r}")
-        if gradient not in (None, *self.gradients):
-            raise ValueError(f"method {self.name} offers the gradients {', '.join(self.gradients)}; got {gradient!r}")
+        self._check_offered(name, gradient)
         if name == "eight_trilinear":
             if (gradient or self.gradients[0]) != self.sampled_gradient:
                 raise ValueError(
@@ -147,6 +207,32 @@ class Method:
         if sampler != "exact":
             raise ValueError(f"sampler={sampler!r} needs scheme='eight_trilinear'; a sum over taps takes no samples")
         return Direct(self.value_terms, name or self.schemes[0], gradient or self.gradients[0])
+
+    def reach(self, prefilter: bool) -> int:
+        return self.kernel.support + (self.prefilter.decay(torch.float64) if prefilter else 0)
+
+    def build(self, volume: Volume, asked: Asked) -> Field:
+        scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
+        coefficients = Coefficients.of(
+            asked.samples,
+            self.prefilter if asked.prefilter else prefilters.IDENTITY,
+            asked.boundary,
+            scheme.reach,
+            self.factor,
+            _storage_for(self, asked.storage),
+            asked.unknown,
+        )
+        if isinstance(scheme, Direct) and scheme.name == "fused" and (why := _missing_for_fused(coefficients, scheme)):
+            if asked.scheme is not None:
+                raise ValueError(f"scheme='fused' can't run here: {why}; scheme='direct' can")
+            scheme = replace(scheme, name="direct")
+        return GridField(self.name, volume, coefficients, scheme)
+
+
+def tensor_product(method: str | Method | PiecewisePolynomial) -> TensorProduct | None:
+    """The method as a tensor product; None for one of another kind, of which nothing is known in closed form."""
+    method = as_method(method)
+    return method if isinstance(method, TensorProduct) else None
 
 
 def _interpolates(kernel: Kernel, prefilter: Prefilter) -> bool:
@@ -161,7 +247,7 @@ def _interpolates(kernel: Kernel, prefilter: Prefilter) -> bool:
 METHODS: dict[str, Method] = {
     m.name: m
     for m in (
-        Method(
+        TensorProduct(
             "trilinear",
             "linear interpolation along each axis: the de facto standard",
             kernels.LINEAR,
@@ -169,8 +255,8 @@ METHODS: dict[str, Method] = {
             sampled=TrilinearCentral,
             sampled_gradient="central",
         ),
-        Method("catmull-rom", "interpolating cubic spline along each axis", kernels.CATMULL_ROM),
-        Method(
+        TensorProduct("catmull-rom", "interpolating cubic spline along each axis", kernels.CATMULL_ROM),
+        TensorProduct(
             "ncrsi",
             "nonseparable Catmull-Rom: order three from the samples of central differences",
             kernels.CATMULL_ROM,
@@ -181,22 +267,22 @@ METHODS: dict[str, Method] = {
             continuity=0,
             taps=32,
         ),
-        Method(
+        TensorProduct(
             "triquadratic",
             "prefiltered quadratic B-spline: C1, analytic gradient from the same eight samples",
             kernels.bspline(2),
             prefilters.QUADRATIC,
             sampled=EightTrilinearQuadratic,
         ),
-        Method(
+        TensorProduct(
             "notch",
             "prefiltered Mitchell-Netravali notch: least staircase aliasing",
             kernels.NOTCH,
             prefilters.NOTCH,
             sampled=EightTrilinearQuadratic,
         ),
-        Method("mitchell", "Mitchell-Netravali (1/3, 1/3): a compromise of blur and ringing", kernels.MITCHELL),
-        Method(
+        TensorProduct("mitchell", "Mitchell-Netravali (1/3, 1/3): a compromise of blur and ringing", kernels.MITCHELL),
+        TensorProduct(
             "tricubic",
             "prefiltered cubic B-spline: C2, order four",
             kernels.bspline(3),
@@ -214,7 +300,7 @@ def named(name: str, methods: Mapping[str, Method] = METHODS) -> Method:
     return methods[name]
 
 
-def from_kernel(kernel: PiecewisePolynomial, prefilter: Prefilter | None = None) -> Method:
+def from_kernel(kernel: PiecewisePolynomial, prefilter: Prefilter | None = None) -> TensorProduct:
     """A method made of any kernel.
 
     Args:
@@ -223,7 +309,7 @@ def from_kernel(kernel: PiecewisePolynomial, prefilter: Prefilter | None = None)
     """
     if prefilter is None:
         prefilter = prefilters.interpolation(kernel) if isinstance(kernel, Kernel) else prefilters.IDENTITY
-    return Method(kernel.name, "made from a kernel", kernel, prefilter)
+    return TensorProduct(kernel.name, "made from a kernel", kernel, prefilter)
 
 
 def as_method(method: str | Method | PiecewisePolynomial) -> Method:
@@ -283,25 +369,12 @@ def reconstruct(
     if not isinstance(prefilter, bool):
         raise TypeError(f"prefilter must be True or False; got {prefilter!r} (from_kernel pairs a kernel with another)")
     volume, method, boundary = as_volume(volume), as_method(method), Boundary.named(boundary)
-    chosen, dtype = method.scheme(scheme, gradient, sampler), _storage_for(method, storage)
+    method.scheme(scheme, gradient, sampler)  # refused before the samples are read
     samples, unknown = missing_values.resolved(volume.samples, nan)
-    coefficients = Coefficients.of(
-        samples,
-        method.prefilter if prefilter else prefilters.IDENTITY,
-        boundary,
-        chosen.reach,
-        method.factor,
-        dtype,
-        unknown,
-    )
-    if isinstance(chosen, Direct) and chosen.name == "fused" and (why := _missing_for_fused(coefficients, chosen)):
-        if scheme is not None:
-            raise ValueError(f"scheme='fused' can't run here: {why}; scheme='direct' can")
-        chosen = replace(chosen, name="direct")
-    return GridField(method.name, volume, coefficients, chosen)
+    return method.build(volume, Asked(samples, unknown, boundary, prefilter, scheme, gradient, sampler, storage))
 
 
-def _storage_for(method: Method, storage: str | torch.dtype | None) -> torch.dtype | None:
+def _storage_for(method: TensorProduct, storage: str | torch.dtype | None) -> torch.dtype | None:
     """The type of that storage. Raises ValueError for integers where an offset would not come back as it is."""
     dtype = named_storage(storage)
     if dtype is not None and not dtype.is_floating_point:

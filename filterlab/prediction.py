@@ -33,7 +33,7 @@ from torch import Tensor
 from filterlab import prefilters
 from filterlab.fields.tensor_product import Direct, same_kernel
 from filterlab.kernels import Kernel, PiecewisePolynomial
-from filterlab.methods import Method, as_method
+from filterlab.methods import Method, TensorProduct, as_method, tensor_product
 from filterlab.ops.stencil import Product, Row
 from filterlab.prefilters import Prefilter
 from filterlab.spectrum import correlation_samples
@@ -175,9 +175,9 @@ def predicted_error(
             of the samples all the same.
 
     Raises:
-        TypeError: a method whose kernel is a tensor.
+        TypeError: a method whose kernel is a tensor, or that is no tensor product: its errors are measured only.
     """
-    method = as_method(method)
+    method = _predictable(method)
     if not isinstance(method.kernel, Kernel):
         raise TypeError(f"errors are predicted for exact kernels; {method.kernel.name} is not one")
     kind = gradient or method.gradients[0]
@@ -197,13 +197,19 @@ def rms_second_derivative(spectrum: Spectrum) -> float:
     return math.sqrt(_mean_square(spectrum.cosines * squared) / 5)
 
 
-def _rows(method: Method, gradient: str) -> tuple[Row, ...]:
+def _predictable(method: str | Method | PiecewisePolynomial) -> TensorProduct:
+    if (found := tensor_product(method)) is None:
+        raise TypeError(f"the errors of {as_method(method).name} have no closed form: they are measured only")
+    return found
+
+
+def _rows(method: TensorProduct, gradient: str) -> tuple[Row, ...]:
     return Direct(method.terms or same_kernel(method.kernel), gradient=gradient).stencils[1].rows
 
 
 @lru_cache(maxsize=64)
 def _error_kernels(
-    method: Method, gradient: str, prefilter: Prefilter, shape: Size, step: int
+    method: TensorProduct, gradient: str, prefilter: Prefilter, shape: Size, step: int
 ) -> tuple[Tensor, Tensor]:
     """√E of the value and of the gradient as a vector, for the frequencies of a cosine transform, (D, H, W)."""
     axes = tuple(w * (step if len(w) > 1 else 1) for w in _frequencies(shape))
@@ -216,7 +222,7 @@ def _error_kernels(
 
 
 def _errors_beyond(
-    spectrum: Spectrum, method: Method, gradient: str, prefilter: Prefilter, step: int
+    spectrum: Spectrum, method: TensorProduct, gradient: str, prefilter: Prefilter, step: int
 ) -> tuple[float, float]:
     """Squared errors of value and gradient from beyond the Nyquist frequency, out to `_FARTHEST`, by quadrature."""
     if spectrum.level <= 0:

@@ -1,4 +1,4 @@
-"""A volume on another grid, by any method: separable where the grids are aligned, point by point where they are not."""
+"""A volume on another grid, by any method: separable where the grids are aligned and the method is, else pointwise."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from filterlab.fields.base import Field
 from filterlab.fields.grid import GridField, Term
 from filterlab.kernels import PiecewisePolynomial
 from filterlab.methods import Method, reconstruct
@@ -60,12 +61,12 @@ def resample(
         prefilter=prefilter,
         nan=nan,
     )
-    assert isinstance(field, GridField)
     steps = np.linalg.solve(volume.affine, geometry.affine)  # new voxel -> old voxel
-    if np.allclose(steps[:3, :3], np.diag(np.diag(steps[:3, :3])), rtol=0, atol=1e-12 * np.abs(steps[:3, :3]).max()):
+    off_axis = np.abs(steps[:3, :3] - np.diag(np.diag(steps[:3, :3]))).max()
+    if isinstance(field, GridField) and off_axis <= 1e-12 * np.abs(steps[:3, :3]).max():
         samples = _separable(field, target_shape, np.diag(steps)[:3], steps[:3, 3], working)
     else:
-        samples = _pointwise(field, target_shape, geometry, working)
+        samples = _pointwise(field, volume.samples.device, target_shape, geometry, working)
     return Volume.with_geometry(samples.to(dtype), geometry)
 
 
@@ -135,9 +136,10 @@ def _along_axis(values: Tensor, dim: int, positions: Tensor, kernel: PiecewisePo
     return total
 
 
-def _pointwise(field: GridField, shape: tuple[int, int, int], geometry: Geometry, dtype: torch.dtype) -> Tensor:
+def _pointwise(
+    field: Field, device: torch.device, shape: tuple[int, int, int], geometry: Geometry, dtype: torch.dtype
+) -> Tensor:
     """The field at every voxel centre of an arbitrary grid, in blocks of about a million points."""
-    device = field.coefficients.values.device
     d, h, w = shape
     voxels = d * h * w
     parts = []

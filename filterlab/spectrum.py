@@ -16,7 +16,7 @@ from torch import Tensor
 from filterlab import prefilters
 from filterlab.fields.base import Field
 from filterlab.kernels import PiecewisePolynomial
-from filterlab.methods import Method, as_method, reconstruct
+from filterlab.methods import Method, TensorProduct, as_method, reconstruct, tensor_product
 from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary
 
@@ -28,13 +28,21 @@ def kernel_response(kernel: PiecewisePolynomial, omega: Tensor) -> Tensor:
     return kernel.fourier(omega).real
 
 
+def closed_form(method: str | Method | PiecewisePolynomial) -> TensorProduct:
+    """The method, if it has a response in closed form. Raises TypeError for one whose response is measured only."""
+    if (found := tensor_product(method)) is None:
+        name = as_method(method).name
+        raise TypeError(f"the response of {name} has no closed form: it is measured only (`measured_response`)")
+    return found
+
+
 def axis_response(method: str | Method | PiecewisePolynomial, omega: Tensor, prefilter: bool = True) -> Tensor:
     """P(ω)Φ(ω) along an axis, closed form, float64 (paper, figures 2-4).
 
     For ncrsi, whose kernel is not separable, this is its 3-D response at (ω, 0, 0): the Catmull-Rom spline's.
     `response` has the whole of it.
     """
-    method = as_method(method)
+    method = closed_form(method)
     omega = omega.to(torch.float64)
     response = kernel_response(method.kernel, omega)
     return response * method.prefilter.response(omega) if prefilter else response
@@ -42,7 +50,7 @@ def axis_response(method: str | Method | PiecewisePolynomial, omega: Tensor, pre
 
 def response(method: str | Method | PiecewisePolynomial, omega: Tensor, prefilter: bool = True) -> Tensor:
     """The 3-D response at angular frequencies `(..., 3)` (x, y, z): Σ_terms Π_axes Φ(ω_d), times Π P(ω_d)."""
-    method = as_method(method)
+    method = closed_form(method)
     omega = omega.to(torch.float64)
     if method.terms is None:
         total = kernel_response(method.kernel, omega).prod(-1)
@@ -64,11 +72,11 @@ def measured_response(
     integral is Gauss-Legendre quadrature on every half voxel; nothing of the closed form is used.
     """
     method = as_method(method)
-    reach = method.kernel.support + (method.prefilter.decay(torch.float64) if prefilter else 0)
+    reach = method.reach(prefilter)
     samples = torch.zeros(1, 1, 2 * reach + 1, dtype=torch.float64, device=omega.device)
     samples[..., reach] = 1
     volume = samples.expand(3, 3, -1)
-    gradient = method.sampled_gradient if scheme == "eight_trilinear" else None
+    gradient = getattr(method, "sampled_gradient", None) if scheme == "eight_trilinear" else None
     field = reconstruct(volume, method, boundary=Boundary.WRAP, prefilter=prefilter, scheme=scheme, gradient=gradient)
     x, weights = _half_voxel_quadrature(2 * reach, omega.device)
     impulse = _mean_over_a_voxel(field, x + reach)
@@ -98,12 +106,12 @@ def smoothing(method: str | Method | PiecewisePolynomial, prefilter: bool = True
 
     d = `dimensions`, 1 (along an axis) or 3. Source: Marschner & Lobb 1994, section 3.
     """
-    return 1 - _energy(as_method(method), prefilter, dimensions, _passband_integral)
+    return 1 - _energy(closed_form(method), prefilter, dimensions, _passband_integral)
 
 
 def postaliasing(method: str | Method | PiecewisePolynomial, prefilter: bool = True, dimensions: int = 1) -> float:
     """P = |R_N|⁻¹ ∫_{outside R_N} |ĥ|² dω: 0 for the ideal filter (Marschner & Lobb 1994, section 3)."""
-    method = as_method(method)
+    method = closed_form(method)
     total = _energy(method, prefilter, dimensions, _whole_integral)
     return total - _energy(method, prefilter, dimensions, _passband_integral)
 
@@ -112,7 +120,7 @@ AxisIntegral = Callable[[PiecewisePolynomial, PiecewisePolynomial, Prefilter], f
 """(p, q, prefilter) -> (2π)⁻¹ ∫ P(ω)² Φ_p(ω) Φ_q(ω) dω over some range of ω."""
 
 
-def _energy(method: Method, prefilter: bool, dimensions: int, integral: AxisIntegral) -> float:
+def _energy(method: TensorProduct, prefilter: bool, dimensions: int, integral: AxisIntegral) -> float:
     """(2π)^−d ∫ |ĥ|² dω; for a sum of separable terms, the sum over pairs of terms of products over axes."""
     if dimensions not in (1, 3):
         raise ValueError(f"dimensions must be 1 or 3; got {dimensions!r}")

@@ -109,6 +109,8 @@ def _errors(config: Config, named: Record, fits: Sequence[Record], chosen: Seque
 
 def _prefilter(record: Record) -> str:
     """What it costs per voxel, once, and of which kind it is."""
+    if "multiplications" not in record:  # of a method that is no tensor product
+        return "its own"
     if record["multiplications"] == 0:
         return "none"
     kind = f"{record['prefilter']} taps" if "candidate" in record else "recursive"

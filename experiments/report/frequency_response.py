@@ -57,13 +57,15 @@ def _curves(config: Config, index: int, title: str, caption: str, records: Seque
 
 def _response(axes: Axes, record: Record, folder: Path, every: tuple[int, int], *, magnitude: bool) -> None:
     style = line_style(record)
-    omega, closed = np.load(run_file(folder, record["omega"])), np.load(run_file(folder, record["closed"]))
     at, measured = np.load(run_file(folder, record["measured_omega"])), np.load(run_file(folder, record["measured"]))
     if magnitude:
-        closed, measured = np.abs(closed), np.abs(measured)
+        measured = np.abs(measured)
         shown = measured > FLOOR
-        at, measured, closed = at[shown], measured[shown], np.maximum(closed, FLOOR / 100)
-    axes.plot(omega, closed, color=style["color"], linestyle=style["linestyle"])
+        at, measured = at[shown], measured[shown]
+    if "closed" in record:
+        omega, closed = np.load(run_file(folder, record["omega"])), np.load(run_file(folder, record["closed"]))
+        drawn = np.maximum(np.abs(closed), FLOOR / 100) if magnitude else closed
+        axes.plot(omega, drawn, color=style["color"], linestyle=style["linestyle"])
     axes.plot(at, measured, markevery=every, **{**style, "linestyle": "none"})
     axes.plot([], [], label=label(record, gradient=False), **style)
 
@@ -95,13 +97,14 @@ def _measures(records: Sequence[Record], dimensions: Sequence[int]) -> Table:
         [
             label(r, gradient=False),
             *(text(r[f"{name}_{d}d"]) for name, d in measures),
-            text(r["at_nyquist"] if abs(r["at_nyquist"]) > 1e-12 else 0.0),
+            text(0.0 if abs(r["at_nyquist"]) < 1e-12 else r["at_nyquist"]),
             text(r["largest_difference"], 2),
         ]
         for r in records
     ]
     caption = (
         "Smoothing and postaliasing after Marschner & Lobb (0 is ideal; smaller is better in both). Last column: the "
-        "largest difference between the closed form and the measured markers."
+        "largest difference between the closed form and the measured markers. A dash: measured only, as the method has "
+        "no closed form."
     )
     return Table(columns, rows, caption)
