@@ -6,6 +6,7 @@ z along D. Points, spacings and origins are in x, y, z order; only tensor shapes
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -217,7 +218,7 @@ class Geometry:
     @property
     def spacing(self) -> tuple[float, float, float]:
         """World length of one voxel step along x, y, z."""
-        return tuple(np.linalg.norm(np.asarray(self.matrix), axis=0).tolist())  # type: ignore[return-value]
+        return tuple(math.hypot(*column) for column in zip(*self.matrix, strict=True))  # type: ignore[return-value]
 
     @property
     def is_identity(self) -> bool:

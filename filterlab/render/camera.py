@@ -22,6 +22,8 @@ Vector = Sequence[float] | Tensor
 Window = tuple[float, float, float, float]
 WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
 
+_LARGEST_EXPONENT = 1000  # of a power of two that is a number of float64, as its inverse is
+
 
 @dataclass(frozen=True, kw_only=True)
 class Camera(ABC):
@@ -223,17 +225,30 @@ def check_window(window: Window) -> None:
 def _basis(position: Tensor, target: Tensor, up: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Orthonormal right, up, forward of a view."""
     view = target - position
-    distance = view.norm()
-    if not distance > 0:
+    if not view.any():
         raise ValueError(f"target must differ from position; both are {position.tolist()}")
-    forward = view / distance
-    if not up.norm() > 0:
+    if not view.isfinite().all():
+        raise ValueError(
+            f"target − position must be finite in float64; got target {target.tolist()}, position {position.tolist()}"
+        )
+    if not up.any():
         raise ValueError("up must not be zero")
-    side = torch.linalg.cross(forward, up / up.norm())
+    forward = _unit(view)
+    side = torch.linalg.cross(forward, _unit(up))
     if not side.norm() > 1e-9:
         raise ValueError(f"up must not lie along the view; got up {up.tolist()}, view {view.tolist()}")
     right = side / side.norm()
     return right, torch.linalg.cross(right, forward), forward
+
+
+def _unit(vector: Tensor) -> Tensor:
+    """vector / |vector| of a finite float64 vector `(3,)` other than 0.
+
+    Its square is taken at a scale where it neither over- nor underflows; a power of two, which changes no digit.
+    """
+    exponent = math.frexp(float(vector.detach().abs().max()))[1]
+    scaled = vector * 2.0 ** -max(min(exponent, _LARGEST_EXPONENT), -_LARGEST_EXPONENT)
+    return scaled / scaled.norm()
 
 
 def _seen_corners(
@@ -248,7 +263,7 @@ def _seen_corners(
         raise ValueError(f"margin must be at least 1; got {margin}")
     corners = domain.corners()
     center = corners.mean(0)
-    if not _vector(direction).norm() > 0:
+    if not _vector(direction).any():
         raise ValueError("direction must not be zero")
     right, upward, forward = _basis(torch.zeros(3, dtype=torch.float64), _vector(direction).cpu(), _vector(up).cpu())
     x, y, z = ((corners - center) @ torch.stack((right, upward, forward), -1)).unbind(-1)

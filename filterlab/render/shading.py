@@ -38,6 +38,14 @@ class Light:
         if c.shape != (3,) or not c.isfinite().all() or (c < 0).any():
             raise ValueError(f"a light's color must be three finite numbers ≥ 0 (linear RGB); got {self.color!r}")
 
+    def toward(self, example: Tensor) -> Tensor:
+        """The unit vector to a light with a direction, `(3,)`, in the dtype and on the device of `example`.
+
+        It is made a unit vector in float64, which has every length of it, and only then rounded to a shorter type.
+        """
+        assert self.direction is not None
+        return _like(safe_normalize(_numbers(self.direction)), example)
+
 
 @dataclass(frozen=True)
 class Shading:
@@ -106,7 +114,7 @@ class Shading:
             if light.direction is None:
                 facing = half = _dot(normal, view).abs()
             else:
-                to_light = safe_normalize(_like(light.direction, view))
+                to_light = light.toward(view)
                 facing = _dot(normal, to_light).abs()
                 half = _dot(normal, safe_normalize(to_light + view)).abs()
             matt = matt + tint * facing[..., None]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from filterlab.fields.base import Domain, Field
 from filterlab.methods import reconstruct
-from filterlab.render import TransferFunction, render
+from filterlab.render import Light, Shading, TransferFunction, render
 from filterlab.render.rays import jitter
 from filterlab.render.transfer import absorbed
 from filterlab.volume import Geometry, Volume
@@ -331,3 +331,25 @@ def _with_threads(threads: int, action: Callable[[], Tensor]) -> Tensor:
         return action()
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("length", [5e-324, 1e-46, 1e39, 1.7e308])
+def test_lights_of_any_length_give_the_same_image(length: float, scheme: str) -> None:
+    field = reconstruct(samples, scheme=scheme)
+    camera = along(N - 1.0, count=5)
+    images = [
+        render(field, transfer=medium(0.3), shading=Shading([Light((s, -s, 0.0))]), **camera) for s in (1.0, length)
+    ]
+    assert torch.equal(*images)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_light_of_any_length_has_finite_derivatives(scheme: str) -> None:
+    for length in (1e-200, 1e200):
+        direction = torch.tensor([1.0, -0.5, 0.2], dtype=torch.float64).mul(length).requires_grad_()
+        field = reconstruct(samples, scheme=scheme)
+        image = render(field, transfer=medium(0.3), shading=Shading([Light(direction)]), **along(N - 1.0, count=5))
+        (found,) = torch.autograd.grad(image[:, :3].sum(), direction)
+        assert found.isfinite().all()
+        assert found.any()
