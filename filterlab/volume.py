@@ -83,6 +83,18 @@ class Boundary(StrEnum):
             out = torch.where(inside, out, torch.zeros((), dtype=x.dtype, device=x.device))
         return out
 
+    def period(self, n: int) -> float | None:
+        """After how many voxels an axis of n repeats; None: it does not."""
+        match self:
+            case Boundary.MIRROR:
+                return max(2.0 * n - 2, 1.0)
+            case Boundary.REFLECT:
+                return 2.0 * n
+            case Boundary.WRAP:
+                return float(n)
+            case _:
+                return None
+
     def interval(self, n: int, tail: int) -> tuple[float, float]:
         """(low, high) between which folded coordinates lie."""
         match self:
@@ -111,7 +123,7 @@ class Boundary(StrEnum):
         """
         low, high = self.interval(n, tail)
         one = x.new_ones(()).expand_as(x)
-        if high > low and _all_between(x, low, high):
+        if high > low and all_between(x, low, high):
             return x, one
         match self:
             case Boundary.MIRROR if n == 1:
@@ -124,7 +136,7 @@ class Boundary(StrEnum):
                 return x.clamp(low, high), torch.where((x < low) | (x > high), 0 * one, one)
 
 
-def _all_between(x: Tensor, low: float, high: float) -> bool:
+def all_between(x: Tensor, low: float, high: float) -> bool:
     """Whether every coordinate is known to lie inside: the common case, in which there is nothing to fold.
 
     Looked at on the CPU only: elsewhere the answer would have to be waited for. False where there is a NaN.

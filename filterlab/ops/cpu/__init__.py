@@ -178,15 +178,15 @@ def _in_order(points: Tensor, shape: Sequence[int], start: int) -> Iterator[tupl
             yield entry, part, order.Sorted(own[part], (shape[2], shape[3], shape[4]), start, lanes)
 
 
-def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor | None]:
-    """`ops.place`, fused: (located, sign); sign None where it is 1 everywhere."""
+def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor | None, bool]:
+    """`ops.place`, fused: (located, sign, lost); sign None where it is 1 everywhere, lost: some are located at NaN."""
     from filterlab.ops.cpu import compiler, folding
     from filterlab.ops.cpu import threads as pool
     from filterlab.ops.cpu.job import AXES
 
     located = _fresh(points.shape, points.dtype, np.empty)
     if points.numel() == 0:
-        return located, None
+        return located, None, False
     points = readable(points, 0)
     lanes, geometry = _lanes(compiler.features(), points.element_size()), placement.geometry
     count = points.numel() // 3
@@ -194,11 +194,11 @@ def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor | None]:
     packs = -(-count // lanes)
     chunk = -(-packs // (threads * _CHUNKS_PER_THREAD if threads > 1 else 1))
     chunks = -(-packs // chunk)
-    turned = np.zeros(chunks, np.int64)
+    met = np.zeros(chunks, np.int64)
     job = folding.Job(
         points=points.data_ptr(),
         located=located.data_ptr(),
-        turned=turned.ctypes.data,
+        met=met.ctypes.data,
         count=count,
         chunk=chunk,
         chunks=chunks,
@@ -220,12 +220,14 @@ def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor | None]:
         pool.run(compiler.compiled(recipe), [job] * threads)
 
     run(False)
-    if not turned.any():
-        return located, None
+    found = int(np.bitwise_or.reduce(met))
+    lost = bool(found & folding.LOST)
+    if not found & folding.TURNED:
+        return located, None, lost
     sign = _fresh(points.shape, points.dtype, np.empty)
     job.signs = sign.data_ptr()
     run(True)
-    return located, sign
+    return located, sign, lost
 
 
 def _how_it_folds(boundary: Boundary, n: int) -> str:
