@@ -165,7 +165,7 @@ def _transposed(matrix: Matrix) -> Matrix:
 def _triple(name: str, value: Sequence[float] | Tensor | np.ndarray | float) -> tuple[float, float, float]:
     try:
         values = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be three finite numbers in x, y, z order; got {value!r}") from None
     if values.ndim == 0:
         values = np.repeat(values, 3)

@@ -107,7 +107,7 @@ class PerspectiveCamera(Camera):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        angle = float(_vector(self.field_of_view).detach())
+        angle = _number("field_of_view must lie between 0 and 180 degrees", self.field_of_view)
         if not 0 < angle < 180:  # a NaN fails too
             raise ValueError(f"field_of_view must lie between 0 and 180 degrees; got {angle}")
 
@@ -166,7 +166,7 @@ class OrthographicCamera(Camera):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        height = float(_vector(self.height).detach())
+        height = _number("height must be a positive world length", self.height)
         if not 0 < height < math.inf:
             raise ValueError(f"height must be a positive world length; got {height}")
 
@@ -206,10 +206,17 @@ def _vector(value: Vector | float, device: torch.device | None = None) -> Tensor
     return torch.as_tensor(value, dtype=torch.float64, device=device)
 
 
+def _number(expected: str, value: float | Tensor) -> float:
+    try:
+        return float(_vector(value).detach())
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):
+        raise ValueError(f"{expected}; got {value!r}") from None
+
+
 def _check_vector(name: str, value: Vector) -> None:
     try:
         v = _vector(value).detach()
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):
         raise ValueError(f"{name} must be three finite numbers; got {value!r}") from None
     if v.shape != (3,) or not v.isfinite().all():
         raise ValueError(f"{name} must be three finite numbers in x, y, z order; got {value!r}")

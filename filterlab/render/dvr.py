@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import SupportsFloat, SupportsIndex
@@ -151,7 +151,7 @@ def prepare(
     _check_arguments(field, camera, transfer, shading, step, termination, dtype, max_samples, memory)
     device = torch.device(device or _device_of(camera, transfer))
     view = _View.of(camera, size, device)
-    color = _check_background(background, dtype, device)
+    color = _check_background(background, device)
     box = None if region is None else check_region(region)
     differentiable = torch.is_grad_enabled() and (
         view.requires_grad
@@ -162,10 +162,12 @@ def prepare(
     )
     brightest = transfer.brightest if shading is None else shading.brightest(transfer.brightest)
     brightest = max(brightest, float(color.detach().max()), 1.0)
-    transfer = transfer.to(dtype, device)
+    lengths = _lengths(field.domain, step, transfer.unit)
+    _check_range(dtype, lengths | (shading.numbers if shading else {}) | {"the brightest colour": brightest})
+    transfer, color = transfer.to(dtype, device), color.to(dtype)
     faint = 0.0 if termination is None or differentiable else termination / brightest
     asked = float(step) * field.domain.voxel_size
-    length = min(asked, 2 * field.domain.diagonal)  # beyond every end there is nothing to cut, only digits to lose
+    length = lengths["the step"]
     media = [Medium(one, transfer, shading, length, faint, differentiable) for one in _unbatched(field)]
     cut = _Cut(field.domain, box, length, asked / length, jitter_seed, differentiable)
     marcher, at_once = _marcher(media[0], memory)
@@ -379,6 +381,8 @@ def _check_arguments(
         raise TypeError(f"shading must be a Shading, or None for unlit; got {type(shading).__name__}")
     if not 0 < _number(step) < math.inf:
         raise ValueError(f"step must be a positive number of voxels; got {step!r}")
+    if not float(step) * field.domain.voxel_size > 0:
+        raise ValueError(f"step must be a world length in float64; got {step!r} voxels of {field.domain.voxel_size:g}")
     if termination is not None and not 0 < _number(termination) < 1:
         raise ValueError(f"termination must be a transmittance between 0 and 1, or None; got {termination!r}")
     if dtype not in (torch.float32, torch.float64):
@@ -389,6 +393,31 @@ def _check_arguments(
         raise ValueError(f"memory must be a positive whole number of bytes; got {memory!r}")
 
 
+def _lengths(domain: Domain, step: float, unit: float) -> dict[str, float]:
+    """World lengths and their inverses that a marcher computes with, by what they are."""
+    longest = 2 * domain.diagonal  # beyond every end there is nothing to cut, only digits to lose
+    length = min(float(step) * domain.voxel_size, longest)
+    return {
+        "the step": length,
+        "the length of a ray": longest,
+        "1 / voxel size": 1 / domain.voxel_size,
+        "1 / unit of the transfer function": 1 / unit,
+        "the step in units of the transfer function": length / unit,
+    }
+
+
+def _check_range(dtype: torch.dtype, numbers: Mapping[str, float]) -> None:
+    """Raises ValueError that names the number an image cannot be computed with: sums of two must not overflow."""
+    limit = torch.finfo(dtype).max / 2
+    for name, number in numbers.items():
+        if not number <= limit:
+            kind = str(dtype).removeprefix("torch.")
+            wider = "" if dtype == torch.float64 else "; float64 reaches further"
+            raise ValueError(
+                f"an image in {kind} is computed with numbers up to {limit:.3g}; {name} is {number:.3g}{wider}"
+            )
+
+
 def _number(value: object) -> float:
     """The value as one number; NaN where it is none."""
     try:
@@ -397,10 +426,10 @@ def _number(value: object) -> float:
         return math.nan
 
 
-def _check_background(background: Sequence[float] | Tensor, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _check_background(background: Sequence[float] | Tensor, device: torch.device) -> Tensor:
     try:
-        color = torch.as_tensor(background, dtype=dtype, device=device)
-    except (TypeError, ValueError):
+        color = torch.as_tensor(background, dtype=torch.float64, device=device)
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):
         color = torch.empty(0)
     if color.shape != (3,) or not color.detach().isfinite().all() or (color.detach() < 0).any():
         raise ValueError(f"background must be three finite numbers ≥ 0 (linear RGB); got {background!r}")

@@ -94,9 +94,22 @@ class Shading:
 
     def brightest(self, color: float) -> float:
         """An upper bound of every lit component for colours of at most `color`."""
+        bounds = self.numbers
+        return color * bounds["ambient + diffuse · light"] + bounds["specular · light"]
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The largest numbers that shading is computed with, by what they are; light is that of all lights together."""
         light = torch.stack([_numbers(light.color).detach().cpu() for light in self.lights] or [torch.zeros(3)])
         total = float(light.sum(0).max())
-        return color * (_plain(self.ambient) + _plain(self.diffuse) * total) + _plain(self.specular) * total
+        return {
+            "light": total,
+            "diffuse": _plain(self.diffuse),
+            "specular": _plain(self.specular),
+            "shininess": _plain(self.shininess),
+            "ambient + diffuse · light": _plain(self.ambient) + _plain(self.diffuse) * total,
+            "specular · light": _plain(self.specular) * total,
+        }
 
     def __call__(self, color: Tensor, gradient: Tensor, direction: Tensor) -> Tensor:
         """Lit colours `(..., 3)`, of colours `(..., 3)`, gradients `(..., 3)` and unit ray directions `(..., 3)`."""
@@ -142,8 +155,12 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _power(base: Tensor, exponent: Tensor) -> Tensor:
-    """base^exponent for base ≥ 0, and 0 with derivative 0 at base = 0 (where 1 < exponent < 2 has no second one)."""
+    """base^exponent for 0 ≤ base ≤ 1, and 0 with derivative 0 at 0 (where 1 < exponent < 2 has no second one).
+
+    A cosine that is rounded to more than 1 is 1: a large exponent would make it infinite.
+    """
     positive = base != 0
+    base = base - (base.detach() - 1).clamp_min(0)
     return torch.where(positive, torch.where(positive, base, torch.ones_like(base)) ** exponent, torch.zeros_like(base))
 
 
@@ -155,7 +172,7 @@ def _checked(name: str, expected: str, value: Sequence[float] | float | Tensor) 
     """The value as float64. Raises ValueError that says what was expected."""
     try:
         return _numbers(value)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):
         raise ValueError(f"{name} must be {expected}; got {value!r}") from None
 
 
