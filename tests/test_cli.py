@@ -431,3 +431,12 @@ def test_any_positive_limit_of_memory_works_or_is_said_to_be_too_small(limit, vo
 def test_a_shape_beyond_all_numbers_is_refused(size, volume_file, tmp_path, capsys):
     line = ["resample", str(volume_file), "-o", str(tmp_path / "out.npy"), "--shape", "3", size, "3"]
     fails(capsys, line, 1, "expected a result of at most 8 GiB")
+
+
+def test_the_package_tells_the_version_that_the_command_tells(capsys):
+    import filterlab
+
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"filterlab {filterlab.__version__}\n"
+    with pytest.raises(AttributeError, match="nothing_of_that_name"):
+        filterlab.nothing_of_that_name  # noqa: B018
