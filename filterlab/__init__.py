@@ -10,4 +10,13 @@ for torch.
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    """A public name, when it is first used; `__version__` is that of the installed package."""
+    if name != "__version__":
+        return _load(name)
+    from importlib.metadata import version
+
+    return version(__name__)

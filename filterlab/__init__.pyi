@@ -8,6 +8,8 @@ from .recommendation import Recommendation, recommend
 from .resampling import resample
 from .volume import Boundary, Volume, from_grid_sample, from_zyx
 
+__version__: str
+
 __all__ = [
     "KERNELS",
     "METHODS",

@@ -173,7 +173,7 @@ class Resample:
         """Bytes that one volume may take."""
         if not 0 < self.max_gigabytes < math.inf:  # a NaN fails too
             raise ValueError(f"expected --max-gigabytes to be a positive number; got {self.max_gigabytes}")
-        return int(self.max_gigabytes * 2**30)
+        return int(min(self.max_gigabytes * 2**30, sys.maxsize))  # beyond that there is nothing to limit
 
     def _new_size(self, source: VolumeHeader, target: VolumeHeader | None) -> list[float]:
         """Voxels along x, y, z of the result; checks what was asked."""
@@ -182,7 +182,7 @@ class Resample:
         if self.shape is not None:
             if min(self.shape) < 1:
                 raise ValueError(f"expected --shape of 1 or more voxels along every axis; got {self.shape}")
-            return list(self.shape)
+            return [_as_float(n) for n in self.shape]
         assert self.spacing is not None
         if not all(math.isfinite(s) and s > 0 for s in self.spacing):
             raise ValueError(f"expected a --spacing of positive numbers; got {self.spacing}")
@@ -539,6 +539,14 @@ def _check_memory(shape: Sequence[float], itemsize: int, limit: int) -> None:
         raise ValueError(f"expected a result of at most {limit / 2**30:g} GiB (--max-gigabytes); got {got}")
     if needed > (installed := _installed_memory()):
         raise ValueError(f"expected a result that fits in the {installed / 2**30:.3g} GiB of this machine; got {got}")
+
+
+def _as_float(n: int) -> float:
+    """The number; ∞ for one that is beyond all floats."""
+    try:
+        return float(n)
+    except OverflowError:
+        return math.inf
 
 
 def _installed_memory() -> float:

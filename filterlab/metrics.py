@@ -15,17 +15,30 @@ def _comparable(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     return a.to(dtype), b.to(dtype)
 
 
+def _at_scale(x: Tensor, dim: int | None = None) -> tuple[Tensor, Tensor]:
+    """(x / s, s) with s the power of two next to the largest |x|: squares stay in range, and no digit changes."""
+    if x.numel() == 0:
+        return x, x.new_ones(())
+    size = x.detach().abs()
+    largest = size.amax() if dim is None else size.amax(dim, keepdim=True)
+    usable = largest.isfinite() & (largest > 0)
+    unit = torch.exp2(torch.where(usable, largest, 1).log2().floor())
+    return x / unit, unit
+
+
 def rms(a: Tensor, b: Tensor, vectors: bool = False) -> Tensor:
     """√mean |a − b|²; with vectors=True |·| is the length along the last axis (gradients)."""
     a, b = _comparable(a, b)
-    squared = (a - b) ** 2
-    return (squared.sum(-1) if vectors else squared).mean().sqrt()
+    difference, unit = _at_scale(a - b)
+    squared = difference**2
+    return unit * (squared.sum(-1) if vectors else squared).mean().sqrt()
 
 
 def max_error(a: Tensor, b: Tensor, vectors: bool = False) -> Tensor:
     """max |a − b|; with vectors=True |·| is the length along the last axis."""
     a, b = _comparable(a, b)
-    return ((a - b).norm(dim=-1) if vectors else (a - b).abs()).max()
+    difference, unit = _at_scale(a - b)
+    return unit * (difference.norm(dim=-1) if vectors else difference.abs()).max()
 
 
 def angular_error(a: Tensor, b: Tensor) -> Tensor:
@@ -34,6 +47,7 @@ def angular_error(a: Tensor, b: Tensor) -> Tensor:
     Where either vector is zero the angle is NaN: it has no direction.
     """
     a, b = _comparable(a, b)
+    a, b = _at_scale(a, dim=-1)[0], _at_scale(b, dim=-1)[0]  # each vector at its own: lengths do not matter
     angle = torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(-1))
     undefined = (a == 0).all(-1) | (b == 0).all(-1)
     return torch.where(undefined, torch.full_like(angle, torch.nan), angle)

@@ -6,6 +6,7 @@ z along D. Points, spacings and origins are in x, y, z order; only tensor shapes
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -82,6 +83,18 @@ class Boundary(StrEnum):
             out = torch.where(inside, out, torch.zeros((), dtype=x.dtype, device=x.device))
         return out
 
+    def period(self, n: int) -> float | None:
+        """After how many voxels an axis of n repeats; None: it does not."""
+        match self:
+            case Boundary.MIRROR:
+                return max(2.0 * n - 2, 1.0)
+            case Boundary.REFLECT:
+                return 2.0 * n
+            case Boundary.WRAP:
+                return float(n)
+            case _:
+                return None
+
     def interval(self, n: int, tail: int) -> tuple[float, float]:
         """(low, high) between which folded coordinates lie."""
         match self:
@@ -110,7 +123,7 @@ class Boundary(StrEnum):
         """
         low, high = self.interval(n, tail)
         one = x.new_ones(()).expand_as(x)
-        if high > low and _all_between(x, low, high):
+        if high > low and all_between(x, low, high):
             return x, one
         match self:
             case Boundary.MIRROR if n == 1:
@@ -123,7 +136,7 @@ class Boundary(StrEnum):
                 return x.clamp(low, high), torch.where((x < low) | (x > high), 0 * one, one)
 
 
-def _all_between(x: Tensor, low: float, high: float) -> bool:
+def all_between(x: Tensor, low: float, high: float) -> bool:
     """Whether every coordinate is known to lie inside: the common case, in which there is nothing to fold.
 
     Looked at on the CPU only: elsewhere the answer would have to be waited for. False where there is a NaN.
@@ -152,7 +165,7 @@ def _transposed(matrix: Matrix) -> Matrix:
 def _triple(name: str, value: Sequence[float] | Tensor | np.ndarray | float) -> tuple[float, float, float]:
     try:
         values = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be three finite numbers in x, y, z order; got {value!r}") from None
     if values.ndim == 0:
         values = np.repeat(values, 3)
@@ -217,7 +230,7 @@ class Geometry:
     @property
     def spacing(self) -> tuple[float, float, float]:
         """World length of one voxel step along x, y, z."""
-        return tuple(np.linalg.norm(np.asarray(self.matrix), axis=0).tolist())  # type: ignore[return-value]
+        return tuple(math.hypot(*column) for column in zip(*self.matrix, strict=True))  # type: ignore[return-value]
 
     @property
     def is_identity(self) -> bool:

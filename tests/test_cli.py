@@ -417,3 +417,26 @@ def test_render_refuses_before_it_works(
     scene_file.rename(picture)
     fails(capsys, ["render", picture, "-o", picture], 1, "other than the input")
     assert sorted(os.listdir(tmp_path)) == ["scene.png"]
+
+
+@pytest.mark.parametrize("limit", ["1e300", "1.7e308", "5e-324"])
+def test_any_positive_limit_of_memory_works_or_is_said_to_be_too_small(limit, volume_file, tmp_path, capsys):
+    line = ["resample", str(volume_file), "-o", str(tmp_path / "out.npy"), "--shape", "3", "3", "3"]
+    code = main([*line, "--max-gigabytes", limit])
+    assert code == (1 if limit == "5e-324" else 0)
+    assert "GiB" in capsys.readouterr().err or code == 0
+
+
+@pytest.mark.parametrize("size", ["1" + "0" * 20, "1" + "0" * 400])
+def test_a_shape_beyond_all_numbers_is_refused(size, volume_file, tmp_path, capsys):
+    line = ["resample", str(volume_file), "-o", str(tmp_path / "out.npy"), "--shape", "3", size, "3"]
+    fails(capsys, line, 1, "expected a result of at most 8 GiB")
+
+
+def test_the_package_tells_the_version_that_the_command_tells(capsys):
+    import filterlab
+
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"filterlab {filterlab.__version__}\n"
+    with pytest.raises(AttributeError, match="nothing_of_that_name"):
+        getattr(filterlab, "nothing_of" + "_that_name")

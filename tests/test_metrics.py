@@ -42,3 +42,14 @@ def test_images():
 def test_shapes_must_agree():
     with pytest.raises(ValueError, match=r"same shape; got \(2,\) and \(3,\)"):
         metrics.rms(torch.zeros(2), torch.zeros(3))
+
+
+@pytest.mark.parametrize("scale", [5e-324, 1e-300, 1e-160, 1e160, 1e300])
+def test_metrics_do_not_leave_the_range_of_their_squares(scale):
+    a = torch.tensor([[3.0, 4.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    b = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 1.0]], dtype=torch.float64)
+    for metric in (metrics.rms, metrics.max_error):
+        for vectors in (False, True):
+            assert float(metric(scale * a, scale * b, vectors)) == pytest.approx(scale * float(metric(a, b, vectors)))
+    assert metrics.angular_error(scale * a[1], b[1] * min(1 / scale, 1e300)) == pytest.approx(math.pi / 4, rel=1e-12)
+    assert metrics.rms(scale * a, scale * a) == 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -208,3 +210,13 @@ def test_a_tiny_spacing_is_no_singular_affine():
 def test_unsigned_types_without_indexing_are_refused():
     with pytest.raises(TypeError, match=r"convert: samples\.to\(torch\.int32\)"):
         Volume(torch.zeros(2, 2, 2, dtype=torch.uint16))
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1e200])
+def test_a_grid_may_be_as_small_or_large_as_its_numbers(scale):
+    turned = np.eye(4)
+    turned[:3, :3] = scale * np.array([[3.0, -4.0, 0.0], [4.0, 3.0, 0.0], [0.0, 0.0, 1.0]])
+    geometry = Geometry.of(affine=turned)
+    assert geometry.spacing == pytest.approx((5 * scale, 5 * scale, scale))
+    domain = Domain.of_grid((2, 2, 2), geometry)
+    assert domain.diagonal == pytest.approx(scale * math.sqrt(10**2 + 10**2 + 2**2))

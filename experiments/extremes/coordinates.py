@@ -18,6 +18,8 @@ from filterlab.render import Light, Shading, TransferFunction, render
 
 SIZE = (6, 7, 9)  # D, H, W of the volumes
 SWEEP = ("method", "scheme", "boundary", "device")
+SHEARED = np.array([[1, 0.25, 0, 0], [0, 1, 0, 0], [0.5, 0, 1, 0], [0, 0, 0, 1]])  # its inverse has zeros, met by ∞
+SPACINGS = (1.0, 0.5)  # with ½ the voxels of a huge point are beyond float32
 
 
 @lru_cache(maxsize=512)
@@ -96,8 +98,15 @@ def _nan_gradients(subject: Subject, points: Tensor, hit: Tensor, axes: Tensor, 
 
 
 def infinite_coordinate(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
-    """One, two or three coordinates of points become ±inf."""
-    tally, field = Tally(1e-5), field_of(subject)
+    """One, two or three coordinates of points become ±inf, in the world of the voxels and in a sheared one."""
+    tally = Tally(1e-5)
+    for affine in (np.eye(4), SHEARED):
+        field = field_of(subject, fl.Volume(samples_on(subject.device), affine=affine))
+        _infinite_in(field, subject, random, amount, tally)
+    return tally.finding()
+
+
+def _infinite_in(field: GridField, subject: Subject, random: np.random.Generator, amount: float, tally: Tally) -> None:
     count = max(int(1000 * amount), 50)
     points = points_inside(random, count, subject.device)
     hit = random.random((count, 3)) < 0.4
@@ -107,16 +116,15 @@ def infinite_coordinate(subject: Subject, random: np.random.Generator, amount: f
     value, gradient = field.jet(torch.where(hit, infinite.float(), points), 1)
     if field.coefficients.boundary.periodic:
         tally.kept(bool(value.isnan().all() and gradient.isnan().all()), "not NaN at infinity", count)
-        return tally.finding()
+        return
     # where the extension is constant: far outside, at a coordinate that float32 has without rounding
     far = torch.where(hit, (1000 * infinite.sign()).float(), points)
     for found, expected in zip((value, gradient), field.jet(far, 1), strict=True):
         tally.error(largest(found - expected), "another value than far outside", count)
     if subject.boundary == "zeros":
         tally.error(largest(value), "not 0 at infinity")
-    else:
+    elif field.domain.geometry.is_identity:
         tally.error(largest(field(infinite.float()[:8]) - _corner_values(field, infinite[:8])), "not a corner's value")
-    return tally.finding()
 
 
 def _corner_values(field: GridField, directions: Tensor) -> Tensor:
@@ -128,24 +136,30 @@ def _corner_values(field: GridField, directions: Tensor) -> Tensor:
 
 
 def huge_coordinate(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
-    """Coordinates from 2²⁴ to 3·10³⁸ voxels, where float32 has integers only: folded as integers of Python are."""
-    tally, field = Tally(2e-5), field_of(subject)
+    """Coordinates from 2²⁴ to 3·10³⁸ world units, where float32 has integers only: folded as integers of Python are."""
+    tally = Tally(2e-5)
+    for spacing in SPACINGS:
+        _huge_in(spacing, subject, random, amount, tally)
+    return tally.finding()
+
+
+def _huge_in(spacing: float, subject: Subject, random: np.random.Generator, amount: float, tally: Tally) -> None:
+    near, field = field_of(subject), field_of(subject, fl.Volume(samples_on(subject.device), spacing=spacing))
     count = max(int(500 * amount), 50)
     exponents = random.uniform(24, 127.99, (count, 3))
     huge = np.float32(np.where(random.random((count, 3)) < 0.5, -1, 1) * 2.0**exponents)
     some = random.random((count, 3)) < 0.5
     inside = points_inside(random, count, subject.device, beyond=0.0).cpu().numpy()
-    points = np.where(some, huge, inside).astype(np.float32)
+    points = np.where(some, huge, spacing * inside).astype(np.float32)
     folded, signs = np.empty((count, 3)), np.empty((count, 3))
     for index in np.ndindex(count, 3):
-        folded[index], signs[index] = _folded(float(points[index]), SIZE[2 - index[1]], subject.boundary)
+        folded[index], signs[index] = _folded(float(points[index]) / spacing, SIZE[2 - index[1]], subject.boundary)
     value, gradient = field.jet(torch.tensor(points, device=subject.device), 1)
-    expected, slope = field.jet(torch.tensor(folded, dtype=torch.float32, device=subject.device), 1)
+    expected, slope = near.jet(torch.tensor(folded, dtype=torch.float32, device=subject.device), 1)
     tally.error(largest(value - expected), "a value that its folded point does not have", count)
     # on a plane of reflection the sign is one of two
-    off = (gradient.abs() - (slope * torch.tensor(signs, device=subject.device).float()).abs()).abs()
+    off = (spacing * gradient.abs() - (slope * torch.tensor(signs, device=subject.device).float()).abs()).abs()
     tally.error(largest(off), "a gradient that its folded point does not have", count)
-    return tally.finding()
 
 
 def _folded(x: float, n: int, boundary: str) -> tuple[float, float]:
@@ -248,7 +262,7 @@ CASES = (
     ),
     Case(
         "infinite-coordinate",
-        "±inf coordinate",
+        "±inf coordinate, also under a sheared affine",
         "border: the edge value; zeros: 0; mirror, reflect and wrap: NaN in that output.",
         infinite_coordinate,
         SWEEP,
@@ -256,7 +270,7 @@ CASES = (
     ),
     Case(
         "huge-coordinate",
-        "coordinates of 2²⁴ … 3·10³⁸ voxels",
+        "coordinates of 2²⁴ … 3·10³⁸, of voxels and of half voxels",
         "Folded as exactly as small ones; border: the edge value; zeros: 0.",
         huge_coordinate,
         SWEEP,

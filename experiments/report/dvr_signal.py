@@ -85,6 +85,6 @@ def _numbers(config: Config, methods: Sequence[Record]) -> Table:
     ]
     caption = (
         "Image errors against the image of the signal itself (displayed values from 0 to 1), and wall-clock seconds to "
-        f"build the field and to render it in plain torch on {config.device}; times depend on what else ran."
+        f"build the field and to render it on {config.device}; times depend on what else ran."
     )
     return Table(columns, rows, caption)

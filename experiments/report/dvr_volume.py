@@ -63,5 +63,5 @@ def _times(config: Config, records: Mapping[str, Record]) -> Table:
         first = next(iter(found.values()))
         times = [fixed(found[n]["render_seconds"], 1) if n in found else MISSING for n in names]
         rows.append([label(first), fixed(first["build_seconds"]), *times])
-    caption = f"Wall-clock seconds in plain torch on {config.device}; they depend on what else ran."
+    caption = f"Wall-clock seconds on {config.device}; they depend on what else ran."
     return Table(columns, rows, caption)

@@ -53,7 +53,7 @@ class Domain:
     def diagonal(self) -> float:
         """World length of the box's diagonal: the diameter of the sphere around it."""
         corners = self.corners()
-        return float(2 * (corners - corners.mean(0)).norm(dim=-1).max())
+        return 2 * max(math.hypot(*offset) for offset in (corners - corners.mean(0)).tolist())
 
 
 class Field(ABC):

@@ -43,6 +43,11 @@ class Chords:
     offset: Tensor
     count: Tensor
 
+    @property
+    def nbytes(self) -> int:
+        """Memory."""
+        return sum(x.nbytes for x in (self.entry, self.direction, self.length, self.offset, self.count))
+
     def at(self, rays: Tensor) -> Chords:
         """Those of some of the rays."""
         return Chords(*(x[rays] for x in (self.entry, self.direction, self.length, self.offset, self.count)))

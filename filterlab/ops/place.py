@@ -5,6 +5,10 @@ Coefficients are stored padded under a boundary, so that no tap is ever folded; 
     located = fold(matrix · (point − origin)) − shift,       sign = d fold / d voxel ∈ {1, −1, 0} along each axis,
 
 and d located_i / d point_j = sign_i · matrix_ij.
+
+A finite point whose voxel coordinate is beyond the range of its type is folded as exactly as any other. A point at
+infinity lies where p + t s ends for t → ∞, p its finite coordinates and s the signs of its infinite ones: along an axis
+of the voxels it is at ±∞, or, where matrix · s is 0, where p is.
 """
 
 from __future__ import annotations

@@ -22,6 +22,8 @@ Vector = Sequence[float] | Tensor
 Window = tuple[float, float, float, float]
 WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
 
+_LARGEST_EXPONENT = 1000  # of a power of two that is a number of float64, as its inverse is
+
 
 @dataclass(frozen=True, kw_only=True)
 class Camera(ABC):
@@ -105,7 +107,7 @@ class PerspectiveCamera(Camera):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        angle = float(_vector(self.field_of_view).detach())
+        angle = _number("field_of_view must lie between 0 and 180 degrees", self.field_of_view)
         if not 0 < angle < 180:  # a NaN fails too
             raise ValueError(f"field_of_view must lie between 0 and 180 degrees; got {angle}")
 
@@ -164,7 +166,7 @@ class OrthographicCamera(Camera):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        height = float(_vector(self.height).detach())
+        height = _number("height must be a positive world length", self.height)
         if not 0 < height < math.inf:
             raise ValueError(f"height must be a positive world length; got {height}")
 
@@ -204,10 +206,17 @@ def _vector(value: Vector | float, device: torch.device | None = None) -> Tensor
     return torch.as_tensor(value, dtype=torch.float64, device=device)
 
 
+def _number(expected: str, value: float | Tensor) -> float:
+    try:
+        return float(_vector(value).detach())
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):
+        raise ValueError(f"{expected}; got {value!r}") from None
+
+
 def _check_vector(name: str, value: Vector) -> None:
     try:
         v = _vector(value).detach()
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):
         raise ValueError(f"{name} must be three finite numbers; got {value!r}") from None
     if v.shape != (3,) or not v.isfinite().all():
         raise ValueError(f"{name} must be three finite numbers in x, y, z order; got {value!r}")
@@ -223,17 +232,30 @@ def check_window(window: Window) -> None:
 def _basis(position: Tensor, target: Tensor, up: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Orthonormal right, up, forward of a view."""
     view = target - position
-    distance = view.norm()
-    if not distance > 0:
+    if not view.any():
         raise ValueError(f"target must differ from position; both are {position.tolist()}")
-    forward = view / distance
-    if not up.norm() > 0:
+    if not view.isfinite().all():
+        raise ValueError(
+            f"target − position must be finite in float64; got target {target.tolist()}, position {position.tolist()}"
+        )
+    if not up.any():
         raise ValueError("up must not be zero")
-    side = torch.linalg.cross(forward, up / up.norm())
+    forward = _unit(view)
+    side = torch.linalg.cross(forward, _unit(up))
     if not side.norm() > 1e-9:
         raise ValueError(f"up must not lie along the view; got up {up.tolist()}, view {view.tolist()}")
     right = side / side.norm()
     return right, torch.linalg.cross(right, forward), forward
+
+
+def _unit(vector: Tensor) -> Tensor:
+    """vector / |vector| of a finite float64 vector `(3,)` other than 0.
+
+    Its square is taken at a scale where it neither over- nor underflows; a power of two, which changes no digit.
+    """
+    exponent = math.frexp(float(vector.detach().abs().max()))[1]
+    scaled = vector * 2.0 ** -max(min(exponent, _LARGEST_EXPONENT), -_LARGEST_EXPONENT)
+    return scaled / scaled.norm()
 
 
 def _seen_corners(
@@ -248,7 +270,7 @@ def _seen_corners(
         raise ValueError(f"margin must be at least 1; got {margin}")
     corners = domain.corners()
     center = corners.mean(0)
-    if not _vector(direction).norm() > 0:
+    if not _vector(direction).any():
         raise ValueError("direction must not be zero")
     right, upward, forward = _basis(torch.zeros(3, dtype=torch.float64), _vector(direction).cpu(), _vector(up).cpu())
     x, y, z = ((corners - center) @ torch.stack((right, upward, forward), -1)).unbind(-1)

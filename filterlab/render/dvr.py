@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import SupportsFloat, SupportsIndex
 
 import torch
@@ -32,7 +32,7 @@ from filterlab.render.fused import FusedMarcher, why_not_fused
 from filterlab.render.plain import Marcher, Medium, PlainMarcher
 from filterlab.render.rays import Region, check_rays, check_region, intersect, jitter, segment_count
 from filterlab.render.shading import Shading
-from filterlab.render.tiles import tiled
+from filterlab.render.tiles import tiled_part
 from filterlab.render.transfer import TransferFunction
 
 Rays = tuple[Tensor, Tensor]
@@ -154,7 +154,7 @@ def prepare(
     _check_arguments(field, camera, transfer, shading, step, termination, dtype, max_samples, memory)
     device = torch.device(device or _device_of(camera, transfer))
     view = _View.of(camera, size, device)
-    color = _check_background(background, dtype, device)
+    color = _check_background(background, device)
     box = None if region is None else check_region(region)
     differentiable = torch.is_grad_enabled() and (
         view.requires_grad
@@ -165,19 +165,29 @@ def prepare(
     )
     brightest = transfer.brightest if shading is None else shading.brightest(transfer.brightest)
     brightest = max(brightest, float(color.detach().max()), 1.0)
-    transfer = transfer.to(dtype, device)
+    lengths = _lengths(field.domain, step, transfer.unit)
+    _check_range(dtype, lengths | (shading.numbers if shading else {}) | {"the brightest colour": brightest})
+    transfer, color = transfer.to(dtype, device), color.to(dtype)
     faint = 0.0 if termination is None or differentiable else termination / brightest
     asked = float(step) * field.domain.voxel_size
-    length = min(asked, 2 * field.domain.diagonal)  # beyond every end there is nothing to cut, only digits to lose
+    length = lengths["the step"]
     media = [Medium(one, transfer, shading, length, faint, differentiable) for one in _unbatched(field)]
     cut = _Cut(field.domain, box, length, asked / length, jitter_seed, differentiable)
     marcher, at_once = _marcher(media[0], memory)
     with torch.set_grad_enabled(differentiable):
-        parts: Sequence[Tensor | Chords] = view.pixels.split(at_once)
-        if len(view.pixels) * _BYTES_PER_RAY <= memory:  # else rays are cut again for every image
-            parts = [cut(view, pixels) for pixels in parts]
+        parts = [_Part(range(i, min(i + at_once, view.count))) for i in range(0, view.count, at_once)]
+        if view.count * _BYTES_PER_RAY <= memory:  # else rays are cut again for every image
+            parts = [replace(part, chords=cut(view, view.pixels(part.order))) for part in parts]
         total = cut.count_all(view, parts, len(media), max_samples)
     return Job(media, marcher, view, cut, parts, total, color, field.channels)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Pixels that are marched together: which in the order of marching, and their rays where they are kept."""
+
+    order: range
+    chords: Chords | None = None
 
 
 @dataclass(frozen=True)
@@ -194,7 +204,7 @@ class Job:
     marcher: Marcher
     _view: _View
     _cut: _Cut
-    _parts: Sequence[Tensor | Chords]
+    _parts: Sequence[_Part]
     samples: int
     _background: Tensor
     _channels: tuple[int, int] | None
@@ -202,7 +212,19 @@ class Job:
     @property
     def pixels(self) -> int:
         """Rays of one image."""
-        return len(self._view.pixels)
+        return self._view.count
+
+    @property
+    def image_bytes(self) -> int:
+        """What all images take."""
+        return self.pixels * len(self.media) * 4 * self.media[0].dtype.itemsize
+
+    @property
+    def ray_bytes(self) -> int:
+        """What rays take, roughly: those that are kept, else those of a part at a time."""
+        largest = max((len(part.order) for part in self._parts), default=0)
+        kept = sum(part.chords.nbytes for part in self._parts if part.chords is not None)
+        return kept + largest * _BYTES_PER_RAY
 
     def chords(self, pixels: Tensor) -> Chords:
         """The rays of some pixels, cut into segments."""
@@ -214,17 +236,31 @@ class Job:
             torch.set_grad_enabled(self.media[0].differentiable),
             _reporting(progress, self.samples) as report,
         ):
-            done, parts = 0, []
-            for medium in self.media:
-                for part in self._parts:
-                    chords = part if isinstance(part, Chords) else self.chords(part)
-                    light, depth = self.marcher.march(medium, chords, lambda n, done=done: report(done + n))
-                    done += int(chords.count.sum())  # with those that early termination saved
-                    parts.append(_over(light, depth[:, None], self._background))
+            images = self._images(report)
             report(self.samples)
-        marched = torch.cat(parts).reshape(len(self.media), self.pixels, 4)
-        images = torch.empty_like(marched).index_copy(1, self._view.pixels, marched)
         return images.reshape(*(self._channels or ()), *self._view.shape, 4)
+
+    def _images(self, report: Callable[[int], None]) -> Tensor:
+        """(images, pixels, 4): without derivatives every part is written where it belongs, and nothing is copied."""
+        background, everywhere = self._background, self._view.pixels
+        if self.media[0].differentiable:
+            marched = torch.cat([image for _, _, image in self._marched(report)] or [background.new_zeros(0, 4)])
+            marched = marched.reshape(len(self.media), self.pixels, 4)
+            return torch.empty_like(marched).index_copy(1, everywhere(range(self.pixels)), marched)
+        images = background.new_empty(len(self.media), self.pixels, 4)
+        for number, part, image in self._marched(report):
+            images[number].index_copy_(0, everywhere(part.order), image)
+        return images
+
+    def _marched(self, report: Callable[[int], None]) -> Iterator[tuple[int, _Part, Tensor]]:
+        """(number of the image, part, its pixels (R, 4)), one after the other."""
+        done = 0
+        for number, medium in enumerate(self.media):
+            for part in self._parts:
+                chords = part.chords or self.chords(self._view.pixels(part.order))
+                light, depth = self.marcher.march(medium, chords, lambda n, done=done: report(done + n))
+                done += int(chords.count.sum())  # with those that early termination saved
+                yield number, part, _over(light, depth[:, None], self._background)
 
 
 def _marcher(medium: Medium, memory: int) -> tuple[Marcher, int]:
@@ -264,15 +300,20 @@ class _View:
 
     Attributes:
         shape: of the image.
-        pixels: their numbers, in the order in which they are marched.
+        pixels: the numbers of those that stand at some places in the order in which they are marched.
         rays: the rays of some pixels.
         requires_grad: whether derivatives by the rays are asked.
     """
 
     shape: tuple[int, ...]
-    pixels: Tensor
+    pixels: Callable[[range], Tensor]
     rays: Callable[[Tensor], Rays]
     requires_grad: bool
+
+    @property
+    def count(self) -> int:
+        """How many pixels there are."""
+        return math.prod(self.shape)
 
     @classmethod
     def of(cls, camera: Camera | Rays, size: Sequence[int] | None, device: torch.device) -> _View:
@@ -280,7 +321,7 @@ class _View:
             if size is None:
                 raise ValueError("size=(width, height) is needed with a camera")
             width, height = check_size(size)
-            pixels = tiled(height, width, device)
+            pixels = _tile_by_tile(height, width, device)
             return cls((height, width), pixels, lambda p: camera.pixel_rays(p, width, height), camera.requires_grad)
         if size is not None:
             raise ValueError(f"size goes with a camera; rays bring their own shape; got size={size!r}")
@@ -288,8 +329,16 @@ class _View:
         o, d = (r.reshape(-1, 3).to(device) for r in check_rays(origins, directions))
         requires_grad = o.requires_grad or d.requires_grad
         shape = tuple(origins.shape[:-1])
-        pixels = tiled(*shape, device) if len(shape) == 2 else torch.arange(len(o), device=device)
+        pixels = _tile_by_tile(*shape, device) if len(shape) == 2 else _one_by_one(device)
         return cls(shape, pixels, lambda p: (o[p], d[p]), requires_grad)
+
+
+def _tile_by_tile(height: int, width: int, device: torch.device) -> Callable[[range], Tensor]:
+    return lambda order: tiled_part(height, width, order.start, order.stop, device)
+
+
+def _one_by_one(device: torch.device) -> Callable[[range], Tensor]:
+    return lambda order: torch.arange(order.start, order.stop, device=device)
 
 
 @dataclass(frozen=True)
@@ -332,14 +381,15 @@ class _Cut:
         return (self.stretch * jitter(self.jitter_seed, pixels)).clamp_max(1)
 
     @torch.no_grad()
-    def count_all(self, view: _View, parts: Sequence[Tensor | Chords], images: int, limit: int) -> int:
-        """How many samples the images take; parts of them are pixels or rays. Raises ValueError above `limit`."""
+    def count_all(self, view: _View, parts: Sequence[_Part], images: int, limit: int) -> int:
+        """How many samples the images take. Raises ValueError above `limit`."""
         total = 0.0
         for part in parts:
-            if isinstance(part, Chords):
-                total += float(part.count.double().sum())
+            if part.chords is not None:
+                total += float(part.chords.count.double().sum())
             else:
-                total += float(segment_count(self.inside(view, part)[2], self.step, self.offset(part)).sum())
+                pixels = view.pixels(part.order)
+                total += float(segment_count(self.inside(view, pixels)[2], self.step, self.offset(pixels)).sum())
         total *= images
         if not total <= limit:
             more = "more than " if total >= _MOST_SEGMENTS else ""
@@ -382,6 +432,8 @@ def _check_arguments(
         raise TypeError(f"shading must be a Shading, or None for unlit; got {type(shading).__name__}")
     if not 0 < _number(step) < math.inf:
         raise ValueError(f"step must be a positive number of voxels; got {step!r}")
+    if not float(step) * field.domain.voxel_size > 0:
+        raise ValueError(f"step must be a world length in float64; got {step!r} voxels of {field.domain.voxel_size:g}")
     if termination is not None and not 0 < _number(termination) < 1:
         raise ValueError(f"termination must be a transmittance between 0 and 1, or None; got {termination!r}")
     if dtype not in (torch.float32, torch.float64):
@@ -392,6 +444,31 @@ def _check_arguments(
         raise ValueError(f"memory must be a positive whole number of bytes; got {memory!r}")
 
 
+def _lengths(domain: Domain, step: float, unit: float) -> dict[str, float]:
+    """World lengths and their inverses that a marcher computes with, by what they are."""
+    longest = 2 * domain.diagonal  # beyond every end there is nothing to cut, only digits to lose
+    length = min(float(step) * domain.voxel_size, longest)
+    return {
+        "the step": length,
+        "the length of a ray": longest,
+        "1 / voxel size": 1 / domain.voxel_size,
+        "1 / unit of the transfer function": 1 / unit,
+        "the step in units of the transfer function": length / unit,
+    }
+
+
+def _check_range(dtype: torch.dtype, numbers: Mapping[str, float]) -> None:
+    """Raises ValueError that names the number an image cannot be computed with: sums of two must not overflow."""
+    limit = torch.finfo(dtype).max / 2
+    for name, number in numbers.items():
+        if not number <= limit:
+            kind = str(dtype).removeprefix("torch.")
+            wider = "" if dtype == torch.float64 else "; float64 reaches further"
+            raise ValueError(
+                f"an image in {kind} is computed with numbers up to {limit:.3g}; {name} is {number:.3g}{wider}"
+            )
+
+
 def _number(value: object) -> float:
     """The value as one number; NaN where it is none."""
     try:
@@ -400,10 +477,10 @@ def _number(value: object) -> float:
         return math.nan
 
 
-def _check_background(background: Sequence[float] | Tensor, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _check_background(background: Sequence[float] | Tensor, device: torch.device) -> Tensor:
     try:
-        color = torch.as_tensor(background, dtype=dtype, device=device)
-    except (TypeError, ValueError):
+        color = torch.as_tensor(background, dtype=torch.float64, device=device)
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):
         color = torch.empty(0)
     if color.shape != (3,) or not color.detach().isfinite().all() or (color.detach() < 0).any():
         raise ValueError(f"background must be three finite numbers ≥ 0 (linear RGB); got {background!r}")

@@ -210,7 +210,7 @@ def _lighting(field: GridField, shading: Shading, direction: Tensor, dtype: torc
             toward.append(view)
             halfway.append(view)
         else:
-            to_light = safe_normalize(number(light.direction))
+            to_light = light.toward(view)
             toward.append(to_light.expand_as(view))
             halfway.append(safe_normalize(to_light + view))
     world = field.domain.geometry.gradient_to_world(torch.eye(3, dtype=torch.float64)).to(view)

@@ -43,7 +43,7 @@ class Plan:
         empty_bricks: which part of the bricks has no opacity; None: no brick is known, as none is looked for.
         skipped: which part of the samples lies in them.
         step: in voxels.
-        volume_bytes, coefficient_bytes, image_bytes: memory.
+        volume_bytes, coefficient_bytes, image_bytes, ray_bytes: memory; rays are those that are in work or kept.
         seconds: of the march, from the median and the quartiles of a few runs of some rays.
         absent: what the scene leaves out and is therefore not computed.
         chosen: how `method: auto` came to its choice, or nothing.
@@ -64,6 +64,7 @@ class Plan:
     volume_bytes: int
     coefficient_bytes: int
     image_bytes: int
+    ray_bytes: int
     seconds: Quartiles
     absent: tuple[str, ...]
     chosen: tuple[str, ...] = ()
@@ -105,7 +106,8 @@ def plan(prepared: Prepared) -> Plan:
         step=prepared.scene.step_or_default,
         volume_bytes=prepared.volume_bytes,
         coefficient_bytes=coefficient_bytes(field),
-        image_bytes=job.pixels * len(job.media) * 4 * medium.dtype.itemsize,
+        image_bytes=job.image_bytes,
+        ray_bytes=job.ray_bytes,
         seconds=seconds,
         absent=_absent(prepared.scene),
         chosen=prepared.chosen,

@@ -27,7 +27,12 @@ def _lines(plan: Plan) -> list[tuple[str, str]]:
     lines.append(("rays", f"{plan.rays:,}"))
     lines.append(("samples", f"{plan.samples:,} at a step of {plan.step:g} voxels"))
     lines.append(("empty space", _skipping(plan)))
-    sizes = (("volume", plan.volume_bytes), ("coefficients", plan.coefficient_bytes), ("image", plan.image_bytes))
+    sizes = (
+        ("volume", plan.volume_bytes),
+        ("coefficients", plan.coefficient_bytes),
+        ("image", plan.image_bytes),
+        ("rays", plan.ray_bytes),
+    )
     lines.append(("memory", ", ".join(f"{name} {size(count)}" for name, count in sizes if count)))
     time = plan.seconds
     spread = f"{duration(time.low)} … {duration(time.high)}"

@@ -52,7 +52,7 @@ def check_region(region: Region) -> tuple[tuple[float, float, float], tuple[floa
     try:
         lower, upper = (tuple(float(c) for c in corner) for corner in region)
         fine = len(lower) == len(upper) == 3 and all(a < b for a, b in zip(lower, upper, strict=True))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         fine, lower, upper = False, (), ()
     if not fine:
         raise ValueError(

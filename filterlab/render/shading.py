@@ -40,6 +40,14 @@ class Light:
         if c.shape != (3,) or not c.isfinite().all() or (c < 0).any():
             raise ValueError(f"a light's color must be three finite numbers ≥ 0 (linear RGB); got {self.color!r}")
 
+    def toward(self, example: Tensor) -> Tensor:
+        """The unit vector to a light with a direction, `(3,)`, in the dtype and on the device of `example`.
+
+        It is made a unit vector in float64, which has every length of it, and only then rounded to a shorter type.
+        """
+        assert self.direction is not None
+        return _like(safe_normalize(_numbers(self.direction)), example)
+
 
 @dataclass(frozen=True)
 class Shading:
@@ -88,9 +96,22 @@ class Shading:
 
     def brightest(self, color: float) -> float:
         """An upper bound of every lit component for colours of at most `color`."""
+        bounds = self.numbers
+        return color * bounds["ambient + diffuse · light"] + bounds["specular · light"]
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The largest numbers that shading is computed with, by what they are; light is that of all lights together."""
         light = torch.stack([_numbers(light.color).detach().cpu() for light in self.lights] or [torch.zeros(3)])
         total = float(light.sum(0).max())
-        return color * (_plain(self.ambient) + _plain(self.diffuse) * total) + _plain(self.specular) * total
+        return {
+            "light": total,
+            "diffuse": _plain(self.diffuse),
+            "specular": _plain(self.specular),
+            "shininess": _plain(self.shininess),
+            "ambient + diffuse · light": _plain(self.ambient) + _plain(self.diffuse) * total,
+            "specular · light": _plain(self.specular) * total,
+        }
 
     def __call__(self, color: Tensor, gradient: Tensor, direction: Tensor) -> Tensor:
         """Lit colours `(..., 3)`, of colours `(..., 3)`, gradients `(..., 3)` and unit ray directions `(..., 3)`."""
@@ -108,7 +129,7 @@ class Shading:
             if light.direction is None:
                 facing = half = dot(normal, view).abs()
             else:
-                to_light = safe_normalize(_like(light.direction, view))
+                to_light = light.toward(view)
                 facing = dot(normal, to_light).abs()
                 half = dot(normal, safe_normalize(to_light + view)).abs()
             matt = matt + tint * facing[..., None]
@@ -124,7 +145,7 @@ def _checked(name: str, expected: str, value: Sequence[float] | float | Tensor) 
     """The value as float64. Raises ValueError that says what was expected."""
     try:
         return _numbers(value)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):
         raise ValueError(f"{name} must be {expected}; got {value!r}") from None
 
 

@@ -21,3 +21,11 @@ def tiled(height: int, width: int, device: torch.device) -> Tensor:
     if height % edge or width % edge:
         numbers = numbers[((y < height) & (x < width)).flatten()]
     return numbers
+
+
+def tiled_part(height: int, width: int, first: int, last: int, device: torch.device) -> Tensor:
+    """`tiled(height, width, device)[first:last]`, of which only the rows of tiles that are touched are made."""
+    row = _EDGES[0] * width  # pixels
+    top = first // row * _EDGES[0]
+    bottom = min(-(-last // row) * _EDGES[0], height)
+    return tiled(bottom - top, width, device)[first - top * width : last - top * width] + top * width

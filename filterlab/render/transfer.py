@@ -43,7 +43,7 @@ class TransferFunction(Table):
 
     def __init__(self, positions: Numbers, colors: Sequence[Numbers] | Tensor, opacities: Numbers, unit: float = 1.0):
         tables = _table("positions", positions), _table("colors", colors), _table("opacities", opacities)
-        super().__init__(*tables, float(unit))
+        super().__init__(*tables, _unit(unit))
         _check_tables(self)
 
     @classmethod
@@ -93,6 +93,7 @@ class TransferFunction(Table):
         for name in ("positions", "colors", "opacities"):
             setattr(out, name, getattr(self, name).to(dtype=dtype, device=device))
         out.unit = self.unit
+        _check_fits(self, out)
         if bool((out.positions.detach().diff() <= 0).any()):
             raise ValueError(f"control points of the transfer function coincide in {dtype}: {self.positions.tolist()}")
         _check_tables(out)  # again: an optimizer may have moved them since
@@ -110,11 +111,30 @@ def _scalar(value: Numbers | float) -> Tensor:
     return torch.as_tensor(value, dtype=torch.float64).reshape(())
 
 
+def _unit(value: float) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"unit must be a positive world length; got {value!r}") from None
+
+
 def _table(name: str, values: Sequence | Tensor) -> Tensor:
     try:
         return values if isinstance(values, Tensor) else torch.as_tensor(values, dtype=torch.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, ArithmeticError, RuntimeError):
         raise ValueError(f"{name} must be numbers; got {values!r}") from None
+
+
+def _check_fits(transfer: TransferFunction, rounded: TransferFunction) -> None:
+    """Raises ValueError for a finite number that the type of `rounded` does not have."""
+    for name in ("positions", "colors"):
+        given, there = getattr(transfer, name).detach(), getattr(rounded, name).detach()
+        if bool((given.isfinite() & ~there.isfinite().to(given.device)).any()):
+            kind = str(there.dtype).removeprefix("torch.")
+            raise ValueError(
+                f"{name} of the transfer function go beyond {kind}, which ends at {torch.finfo(there.dtype).max:.3g}; "
+                f"got {given.tolist()}"
+            )
 
 
 def _check_tables(transfer: TransferFunction) -> None:
@@ -129,6 +149,9 @@ def _check_tables(transfer: TransferFunction) -> None:
         raise ValueError("positions, colors and opacities must be finite floating-point numbers")
     if m > 1 and not bool((x.diff() > 0).all()):
         raise ValueError(f"positions must increase from one control point to the next; got {x.tolist()}")
+    if not bool(x.diff().isfinite().all()):
+        kind = str(x.dtype).removeprefix("torch.")
+        raise ValueError(f"positions must be less than the largest {kind} apart; got {x.tolist()}")
     if not bool(((alpha >= 0) & (alpha <= 1)).all()):
         raise ValueError(f"opacities must lie in 0 … 1; got {alpha.tolist()}")
     if not bool((rgb >= 0).all()):

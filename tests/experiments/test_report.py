@@ -140,6 +140,8 @@ def test_numbers_have_fixed_decimals():
 
 
 def test_every_method_has_its_own_look():
+    missing = [name for name in fl.METHODS if name not in style.LOOKS]
+    assert not missing, f"give {', '.join(missing)} a colour and a marker in LOOKS of experiments/report/style.py"
     looks = [style.LOOKS[name] for name in fl.METHODS]
     for attribute in ("light", "dark", "marker"):
         assert len({getattr(own, attribute) for own in looks}) == len(looks)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
 from itertools import product
 
 import pytest
 import torch
 from torch import Tensor
 
+from filterlab.methods import reconstruct
 from filterlab.ops import Placement, place
-from filterlab.volume import Boundary, Geometry
+from filterlab.volume import Boundary, Geometry, Volume
 
 SHEARED = torch.tensor([[1, 0.2, 0, 3], [0, -1, 0.1, 2], [0.3, 0, 2, 1], [0, 0, 0, 1]], dtype=torch.float64)
 GEOMETRIES = {
@@ -93,3 +96,99 @@ def test_derivative(placement: Placement, implementation: str) -> None:
     plain = torch.autograd.functional.jacobian(located, points.detach())
     for i in range(6):
         torch.testing.assert_close(jacobian[i, 0, 0, :, 0, 0, :], plain[0, i, :, 0, i, :])
+
+
+# --- beyond the range of a type --------------------------------------------------------------------------------------
+
+IMPLEMENTATIONS = ["reference", "cpu"]
+LARGEST = {torch.float32: 3.4028234e38, torch.float64: 1.7e308}
+SHEAR = [[1.0, 0.25, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 1.0]]  # its inverse has the exact zeros that ∞ · 0 is about
+
+
+def affine(matrix: list[list[float]]) -> Geometry:
+    whole = torch.eye(4, dtype=torch.float64)
+    whole[:3, :3] = torch.tensor(matrix, dtype=torch.float64)
+    return Geometry.of(affine=whole)
+
+
+def folded(x: Fraction, n: int, boundary: Boundary, tail: int) -> Fraction:
+    """The fold of an exact coordinate, from the picture of each extension."""
+    if boundary in (Boundary.BORDER, Boundary.ZEROS):
+        return min(max(x, Fraction(-tail)), Fraction(n - 1 + tail))
+    if boundary is Boundary.WRAP:
+        return x % n
+    if boundary is Boundary.MIRROR:
+        x = x % (2 * n - 2)
+        return min(x, 2 * n - 2 - x)
+    x = (x + Fraction(1, 2)) % (2 * n)
+    return min(x, 2 * n - x) - Fraction(1, 2)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("boundary", Boundary)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_a_finite_point_folds_exactly_where_its_voxel_coordinate_is_not_finite(dtype, boundary, implementation) -> None:
+    steps, size, tail = (0.5, 2.0**-40, 0.25), (5, 8, 1000), 3
+    placement = Placement(Geometry.of(steps), boundary, size, tail)
+    far = LARGEST[dtype] * torch.tensor([1.0, 0.7, 0.501, 0.26, 0.1, 1e-3], dtype=dtype)
+    points = torch.stack((far, -far.flip(0), far * 0.9), -1)[None]
+    located, sign = place(points, placement, implementation)
+    assert not placement.geometry.to_voxel(points).isfinite().all()
+    for row, found in zip(points[0].tolist(), located[0].tolist(), strict=True):
+        for x, step, n, y in zip(row, steps, size, found, strict=True):
+            assert y == float(folded(Fraction(x) / Fraction(step), n, boundary, tail))
+    assert sign is None or sign.isfinite().all()
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("boundary", Boundary)
+@pytest.mark.parametrize("geometry", [Geometry(), Geometry.of((0.5, 2, 3), (1, 2, 3)), affine(SHEAR)], ids=range(3))
+def test_a_point_at_infinity_is_where_the_points_before_it_go(geometry, boundary, implementation) -> None:
+    """p + t s for a large t is there already where the extension is constant; NaN where it has a period."""
+    inf, placement = math.inf, Placement(geometry, boundary, (5, 6, 7), 3)
+    rows = [(a, b, c) for a in (-inf, 1.5, inf) for b in (-inf, 2.25, inf) for c in (-inf, 1.0, inf)]
+    points = torch.tensor(rows, dtype=torch.float64)[None]
+    infinite = points.isinf()
+    before = torch.where(infinite, points.sign() * 2.0**40, points)
+    located, sign = place(points, placement, implementation)
+    expected, expected_sign = place(before, placement)
+    if boundary.periodic:
+        assert torch.equal(located.isnan().any(-1), infinite.any(-1))
+        return
+    torch.testing.assert_close(located, expected, rtol=0, atol=1e-3)  # 2⁴⁰ has so many digits left
+    assert sign is not None
+    assert torch.equal(sign, expected_sign)
+    poisoned = torch.where(infinite[0, :, :1], points, torch.nan)  # whatever else is infinite, NaN stays NaN
+    poisoned = place(torch.cat((points[..., :2], poisoned[..., 2:]), -1), placement, implementation)[0]
+    assert torch.equal(poisoned.isnan().any(-1)[0], ~infinite[0, :, 0])
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("boundary", Boundary)
+def test_a_sum_that_left_the_range_of_its_type_comes_back(boundary, implementation) -> None:
+    """x − y of two huge equal numbers, each of them too large when multiplied: 2.5."""
+    placement = Placement(affine([[0.125, 0.125, 0.0], [0.0, 0.125, 0.0], [0.0, 0.0, 1.0]]), boundary, (5, 6, 7), 3)
+    points = torch.tensor([[[3e38, 3e38, 2.5]]])
+    located, _ = place(points, placement, implementation)
+    assert located[0, 0, [0, 2]].tolist() == [0.0, 2.5]
+    y = float(torch.tensor(3e38)) * 8
+    assert located[0, 0, 1] == float(folded(Fraction(y), 6, boundary, 3))
+
+
+@pytest.mark.parametrize("scheme", ["direct", "fused"])
+@pytest.mark.parametrize("boundary", Boundary)
+def test_values_and_derivatives_are_finite_there(boundary, scheme) -> None:
+    values = torch.rand(5, 6, 7, generator=torch.Generator().manual_seed(4))
+    rows = [(3e38, 1.0, 2.0), (3e38, -3e38, 3e38), (1.0, 2.0, 3.0)]
+    rows += [] if boundary.periodic else [(math.inf, 1.0, 2.0), (-math.inf, math.inf, 2.0), (math.inf,) * 3]
+    for volume in (Volume(values, spacing=0.5), Volume(values, affine=affine(SHEAR).affine)):
+        samples = values.clone().requires_grad_()
+        field = reconstruct(Volume.with_geometry(samples, volume.geometry), boundary=boundary, scheme=scheme)
+        points = torch.tensor(rows, requires_grad=True)
+        value, gradient = field.value_and_gradient(points)
+        assert value.isfinite().all()
+        assert gradient.isfinite().all()
+        if boundary is Boundary.ZEROS:
+            torch.testing.assert_close(value[[0, *range(3, len(rows))]], torch.zeros(len(rows) - 2), rtol=0, atol=1e-6)
+        found = torch.autograd.grad(value.sum() + gradient.square().sum(), (points, samples))
+        assert all(x.isfinite().all() for x in found)

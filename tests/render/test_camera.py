@@ -103,3 +103,45 @@ def test_more_mistakes():
     for arguments in ({"direction": (0, 0, 0)}, {"direction": (0, 0, 1)}, {"aspect": 0.0}, {"margin": 0.5}):
         with pytest.raises(ValueError, match=r"direction|up|aspect|margin"):
             PerspectiveCamera.framing(domain, **arguments)
+
+
+LENGTHS = [5e-324, 1e-300, 1e-170, 1e-46, 1e39, 1e160, 1e300, 1.7e308]
+
+
+@pytest.mark.parametrize("length", LENGTHS)
+@pytest.mark.parametrize("kind", [PerspectiveCamera, OrthographicCamera])
+def test_no_length_of_a_direction_or_an_up_changes_a_view(kind, length):
+    domain = Domain.of_grid((2, 3, 4), Geometry())
+    for direction, up in (((1.0, 1.0, 0.0), (0.0, 0.0, length)), ((length, length, 0.0), (0.0, 0.0, 1.0))):
+        expected = kind.framing(domain, (1.0, 1.0, 0.0), up=(0.0, 0.0, 1.0)).rays(3, 2)
+        for a, b in zip(kind.framing(domain, direction, up=up).rays(3, 2), expected, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("length", LENGTHS)
+def test_a_pose_may_be_as_far_as_its_numbers_reach(length):
+    near = PerspectiveCamera(position=(0.0, -1.0, 0.0), target=(0.0, 0.0, 0.0)).rays(3, 2)[1]
+    far = PerspectiveCamera(position=(0.0, -length, 0.0), target=(0.0, 0.0, 0.0)).rays(3, 2)[1]
+    torch.testing.assert_close(far, near, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1e200])
+@pytest.mark.parametrize("kind", [PerspectiveCamera, OrthographicCamera])
+def test_a_domain_of_any_size_is_framed(kind, scale):
+    one, other = (kind.framing(Domain.of_grid((2, 3, 4), Geometry.of(s))).rays(3, 2) for s in (1.0, scale))
+    torch.testing.assert_close(other[1], one[1], rtol=1e-14, atol=1e-14)
+    torch.testing.assert_close(other[0] / scale, one[0], rtol=1e-13, atol=1e-13)
+
+
+def test_an_up_of_any_length_has_finite_derivatives():
+    for length in (1e-300, 1e300):
+        up = torch.tensor([0.1, 0.2, 1.0], dtype=torch.float64).mul(length).requires_grad_()
+        camera = PerspectiveCamera(position=(0.0, -4.0, 0.0), target=(0.0, 0.0, 0.0), up=up)
+        (found,) = torch.autograd.grad(camera.rays(3, 2)[1][0, 0, 0], up)
+        assert found.isfinite().all()
+        assert found.any()
+
+
+def test_a_view_longer_than_float64_is_refused():
+    with pytest.raises(ValueError, match="target − position must be finite in float64"):
+        PerspectiveCamera(position=(0.0, -1.7e308, 0.0), target=(0.0, 1.7e308, 0.0))

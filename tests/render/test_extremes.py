@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 
 import pytest
@@ -14,7 +15,7 @@ from torch import Tensor
 from filterlab.fields.base import Domain, Field
 from filterlab.methods import reconstruct
 from filterlab.ops.reference.optics import absorbed
-from filterlab.render import TransferFunction, render
+from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.rays import jitter
 from filterlab.volume import Geometry, Volume
 
@@ -331,3 +332,182 @@ def _with_threads(threads: int, action: Callable[[], Tensor]) -> Tensor:
         return action()
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("length", [5e-324, 1e-46, 1e39, 1.7e308])
+def test_lights_of_any_length_give_the_same_image(length: float, scheme: str) -> None:
+    field = reconstruct(samples, scheme=scheme)
+    camera = along(N - 1.0, count=5)
+    images = [
+        render(field, transfer=medium(0.3), shading=Shading([Light((s, -s, 0.0))]), **camera) for s in (1.0, length)
+    ]
+    assert torch.equal(*images)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_light_of_any_length_has_finite_derivatives(scheme: str) -> None:
+    for length in (1e-200, 1e200):
+        direction = torch.tensor([1.0, -0.5, 0.2], dtype=torch.float64).mul(length).requires_grad_()
+        field = reconstruct(samples, scheme=scheme)
+        image = render(field, transfer=medium(0.3), shading=Shading([Light(direction)]), **along(N - 1.0, count=5))
+        (found,) = torch.autograd.grad(image[:, :3].sum(), direction)
+        assert found.isfinite().all()
+        assert found.any()
+
+
+# --- numbers that an image cannot be computed with --------------------------------------------------------------------
+
+BLACK = {"ambient": 0.0, "diffuse": 0.0, "specular": 0.0}
+WEIGHTS = {
+    "ambient": lambda x: Shading(**{**BLACK, "ambient": x}),
+    "diffuse": lambda x: Shading(**{**BLACK, "diffuse": x}),
+    "specular": lambda x: Shading(**{**BLACK, "specular": x}),
+    "light": lambda x: Shading([Light(None, (x, x, x)), Light((1.0, 0.5, 0.0), (x, x, x))]),
+}
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_weights_of_light_are_refused_by_name_or_scale_the_image(name: str, scheme: str) -> None:
+    field, rays = reconstruct(samples.double(), scheme=scheme), along(N - 1.0, count=5)
+    make = WEIGHTS[name]
+    for size in (1e39, 1e300):
+        with pytest.raises(ValueError, match=f"an image in float32 .* up to 1.7e.38; .*{name}.* is .*e.*; float64"):
+            render(field, transfer=medium(0.3), shading=make(size), **rays)
+        bright = render(field, transfer=medium(0.3), shading=make(size), dtype=torch.float64, **rays)
+        expected = render(field, transfer=medium(0.3), shading=make(1.0), dtype=torch.float64, **rays)
+        ambient = 0.0 if name != "light" else 0.2 * torch.tensor(RGB).double() * expected[:, 3:]
+        expected = expected[:, :3] - ambient  # which does not grow with the lights
+        torch.testing.assert_close(bright[:, :3] / size, expected, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="an image in float64"):
+        render(field, transfer=medium(0.3), shading=make(1.7e308), dtype=torch.float64, **rays)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_backgrounds_colours_units_and_voxels_are_refused_by_name(scheme: str) -> None:
+    field, rays = reconstruct(samples, scheme=scheme), along(N - 1.0)
+    glow = TransferFunction([0.0, 1.0], [[1e39, 0, 0], [1, 1, 1]], [0.1, 0.2])
+    with pytest.raises(ValueError, match=r"brightest colour is 1e.39"):
+        render(field, transfer=glow, **rays)
+    with pytest.raises(ValueError, match=r"brightest colour is 1e.39"):
+        render(field, transfer=medium(0.3), background=(1e39, 0, 0), **rays)
+    with pytest.raises(ValueError, match=r"1 / unit of the transfer function is 1e.300"):
+        render(field, transfer=medium(0.3, 1e-300), **rays)
+    with pytest.raises(ValueError, match=r"shininess is 1e.39"):
+        render(field, transfer=medium(0.3), shading=Shading(shininess=1e39), **rays)
+    for x in (1e-200, 1e200):
+        small = reconstruct(Volume(samples, spacing=x), scheme=scheme)
+        with pytest.raises(
+            ValueError, match=r"(1 / voxel size|length of a ray|step) is .*e.*; float64 reaches further"
+        ):
+            render(small, transfer=medium(0.3, x), shading=Shading(), **along(N - 1.0, x))
+        lit = render(small, transfer=medium(0.3, x), shading=Shading(), dtype=torch.float64, **along(N - 1.0, x))
+        expected = render(field, transfer=medium(0.3), shading=Shading(), dtype=torch.float64, **along(N - 1.0))
+        torch.testing.assert_close(lit, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_control_points_beyond_the_type_are_refused() -> None:
+    far = TransferFunction([-1e39, 1e39], [[1, 1, 1]] * 2, [0.1, 0.2])
+    with pytest.raises(ValueError, match=r"positions of the transfer function go beyond float32, which ends at 3.4e"):
+        far.to(torch.float32)
+    with pytest.raises(ValueError, match="positions must be less than the largest float32 apart"):
+        TransferFunction([-3e38, 3e38], [[1, 1, 1]] * 2, [0.1, 0.2]).to(torch.float32)
+    with pytest.raises(ValueError, match="positions must be less than the largest float64 apart"):
+        TransferFunction([-1.7e308, 1.7e308], [[1, 1, 1]] * 2, [0.1, 0.2])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_a_cosine_that_is_rounded_to_more_than_one_is_one(dtype: torch.dtype) -> None:
+    """(1 + ε)^shininess would be infinite."""
+    generator = torch.Generator().manual_seed(5)
+    rays = torch.randn(2000, 3, generator=generator, dtype=dtype)
+    rays = rays / rays.norm(dim=-1, keepdim=True)
+    white = torch.ones(2000, 3, dtype=dtype)
+    for shininess in (1e9, 1e18, 1e38):
+        lit = Shading(ambient=0.0, diffuse=0.0, specular=1.0, shininess=shininess)(white, -rays, rays)
+        assert lit.isfinite().all()
+        assert lit.max() == 1
+
+
+def test_a_highlight_of_any_shininess_is_finite_when_it_is_fused() -> None:
+    x, y, z = torch.meshgrid(*[torch.arange(float(N))] * 3, indexing="ij")
+    generator = torch.Generator().manual_seed(5)
+    for _ in range(10):
+        slope = torch.randn(3, generator=generator)
+        field = reconstruct(slope[2] * x + slope[1] * y + slope[0] * z, boundary="border", scheme="fused")
+        direction = slope[None].double()
+        origin = torch.tensor([[5.5, 5.5, 5.5]]).double() - 20 * direction
+        for shininess in (1e9, 1e38):
+            shading = Shading(ambient=0.0, diffuse=0.0, specular=1.0, shininess=shininess)
+            image = render(field, (origin, direction), medium(0.3), shading=shading)
+            assert image.isfinite().all()
+            assert image.max() <= 1.001
+
+
+sizes = st.sampled_from([0.0, 5e-324, 1e-300, 1e-46, 1e-30, 1.0, 1e30, 1e37, 3e38, 1e39, 1e300, 1.7e308])
+positive = sizes.filter(bool)
+
+
+@few
+@given(
+    weights=st.tuples(sizes, sizes, sizes),
+    light=st.tuples(sizes, sizes, sizes),
+    shininess=positive.map(lambda x: max(x, 1.0)),
+    color=sizes,
+    background=sizes,
+    unit=positive,
+    step=positive,
+    spacing=st.sampled_from([1e-300, 1e-39, 1e-30, 1.0, 1e30, 1e39, 1e300]),
+    span=st.tuples(sizes, sizes).filter(lambda pair: pair[0] < pair[1]),
+    scheme=st.sampled_from(SCHEMES),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+def test_an_image_is_finite_or_refused(
+    weights, light, shininess, color, background, unit, step, spacing, span, scheme, dtype
+) -> None:
+    """Whatever numbers are given, no NaN and no infinity comes out of them."""
+    field, refusal = reconstruct(Volume(samples, spacing=spacing), scheme=scheme), ""
+    try:
+        transfer = TransferFunction(span, [[color, 0.5, 1.0], [1.0, 0.5, color]], [0.0, 0.5], unit)
+        shading = Shading([Light((1.0, 1.0, 0.0), light), Light()], *weights, shininess)
+        rays = along(N - 1.0, spacing, count=3)
+        image = render(
+            field,
+            transfer=transfer,
+            shading=shading,
+            background=(background, 0.0, 1.0),
+            step=step,
+            dtype=dtype,
+            max_samples=10**5,
+            **rays,
+        )
+    except ValueError as error:
+        image, refusal = torch.zeros(1), str(error)
+    assert image.isfinite().all()
+    assert re.search(r"^$|image in float|image would take|transfer function|positions|step must be", refusal)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda x: Light((x, 0.0, 0.0)),
+        lambda x: Light(None, (x, 0.0, 0.0)),
+        lambda x: Shading(ambient=x),
+        lambda x: TransferFunction([0.0, x], [[1.0] * 3] * 2, [0.1, 0.2]),
+        lambda x: TransferFunction([0.0, 1.0], [[1.0] * 3] * 2, [0.1, 0.2], unit=x),
+        lambda x: PerspectiveCamera(position=(x, 0.0, 0.0), target=(0.0, 0.0, 0.0)),
+        lambda x: PerspectiveCamera(position=(1.0, 0.0, 0.0), target=(0.0, 0.0, 0.0), field_of_view=x),
+        lambda x: OrthographicCamera(position=(1.0, 0.0, 0.0), target=(0.0, 0.0, 0.0), height=x),
+        lambda x: Volume(samples, spacing=x),
+        lambda x: Volume(samples, origin=(x, 0.0, 0.0)),
+        lambda x: render(reconstruct(samples), transfer=medium(0.3), background=(x, 0.0, 0.0), **along(3.0)),
+        lambda x: render(reconstruct(samples), transfer=medium(0.3), step=x, **along(3.0)),
+        lambda x: render(
+            reconstruct(samples), transfer=medium(0.3), **{**along(3.0), "region": ((0, 0, 0), (x, x, x))}
+        ),
+    ],
+)
+def test_integers_beyond_all_floats_are_refused(make: Callable[[int], object]) -> None:
+    with pytest.raises(ValueError, match=r"must|region"):
+        make(10**400)

@@ -124,3 +124,15 @@ def test_mistakes(make, message):
 def test_lights_are_lights(lights):
     with pytest.raises(TypeError, match="lights must be a sequence of Light objects; got"):
         Shading(lights)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("length", [5e-324, 1e-300, 1e-46, 1e39, 1e300, 1.7e308])
+def test_no_length_of_a_light_s_direction_changes_anything(length, dtype):
+    gradient, rays = torch.randn(9, 3, dtype=dtype), safe_normalize(torch.randn(9, 3, dtype=dtype))
+    direction = torch.tensor([1.0, 0.0, -1.0], dtype=torch.float64)
+    lit = []
+    for size in (1.0, length):
+        shading = Shading((Light(direction * size),))
+        lit.append(shading(torch.ones(9, 3, dtype=dtype), gradient, rays))
+    assert torch.equal(*lit)

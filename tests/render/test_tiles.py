@@ -7,7 +7,7 @@ import torch
 
 from filterlab import Volume, reconstruct
 from filterlab.render import OrthographicCamera, TransferFunction, render
-from filterlab.render.tiles import tiled
+from filterlab.render.tiles import tiled, tiled_part
 
 CPU = torch.device("cpu")
 
@@ -44,3 +44,11 @@ def test_the_image_does_not_depend_on_the_order(scheme: str) -> None:
     others[9, 10] = False
     assert bool((gradient[others] == 0).all())
     assert bool((gradient[9, 10] != 0).any())
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (16, 16), (33, 47), (50, 3), (3, 50)])
+def test_a_part_is_cut_out_of_the_whole(height, width):
+    whole = tiled(height, width, CPU)
+    for first in range(0, height * width, 7):
+        for last in (first, first + 1, min(first + 300, height * width), height * width):
+            assert torch.equal(tiled_part(height, width, first, last, CPU), whole[first:last])

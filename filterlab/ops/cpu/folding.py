@@ -9,7 +9,8 @@
     located = folded − shift
 
 x mod p is exact for any finite x: with |x| < 2^k p, subtract 2^(k−1) p, …, 2p, p wherever that much is left; every
-difference is exact. ±inf becomes NaN, but under clamp.
+difference is exact. ±inf becomes NaN, but under clamp; what is at NaN is counted, as it may be a point that is finite,
+and only its voxel coordinate beyond the range of its type (`ops.place`).
 """
 
 from __future__ import annotations
@@ -23,12 +24,15 @@ from filterlab.ops.cpu import frame
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import I1, I64, Lanes, Value
 
+TURNED, LOST = 1, 2
+"""What a chunk may have met: a sign that is not 1; a point that is located at NaN."""
+
 FIELDS: dict[str, type] = {
     "next": ctypes.c_int64,  # the chunk to be taken next
     "points": ctypes.c_void_p,  # (M, 3)
     "located": ctypes.c_void_p,  # (M, 3)
     "signs": ctypes.c_void_p,  # (M, 3); written if the recipe says so
-    "turned": ctypes.c_void_p,  # one i64 per chunk: whether a sign there is not 1
+    "met": ctypes.c_void_p,  # one i64 per chunk: TURNED, LOST or both
     "count": ctypes.c_int64,  # M
     "chunk": ctypes.c_int64,  # packs of a chunk
     "chunks": ctypes.c_int64,
@@ -79,14 +83,14 @@ class _Program:
         e, b = self.lanes, self.builder
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         self.copied = [e.reserve(e.number, 3 * e.count) for _ in range(3)]  # points, located, signs of a partial pack
-        self.turned = e.variable(I64(0))
+        self.met = e.variable(I64(0))
         with frame.every_chunk(e, j) as chunk:
             packs = b.udiv(b.add(j.count, I64(e.count - 1)), I64(e.count))
             first = b.mul(chunk, j.chunk)
-            self.turned.value = I64(0)
+            self.met.value = I64(0)
             with e.repeat(first, e.smaller(b.add(first, j.chunk), packs)) as pack:
                 self._write_pack(pack)
-            b.store(self.turned.value, e.advance(j.turned, chunk, I64))
+            b.store(self.met.value, e.advance(j.met, chunk, I64))
         b.ret_void()
 
     def _write_pack(self, pack: Value) -> None:
@@ -139,7 +143,9 @@ class _Program:
             folded.value = b.select(inside, x, outside)
             sign.value = b.select(inside, e.constant(1), turned)
             if self.recipe.axes[axis] != "wrap":
-                self.turned.value = I64(1)
+                self.met.value = b.or_(self.met.value, I64(TURNED))
+            lost = b.select(e.any(b.fcmp_unordered("uno", outside, outside)), I64(LOST), I64(0))
+            self.met.value = b.or_(self.met.value, lost)
         return folded.value, sign.value
 
     def _reflect(self, x: Value, low: Value, high: Value) -> tuple[Value, Value]:
@@ -160,6 +166,8 @@ class _Program:
 
     def _clamp(self, x: Value, low: Value, high: Value) -> tuple[Value, Value]:
         e, b = self.lanes, self.builder
+        if self.recipe.affine == "full":  # a sum that left the range of its type may have come back: ∞ + (∞ − ∞) = NaN
+            x = e.add(x, e.subtract(x, x))
         below, above = b.fcmp_ordered("<", x, low), b.fcmp_ordered(">", x, high)
         constant = b.or_(below, above)
         return b.select(below, low, b.select(above, high, x)), b.select(constant, e.constant(0), e.constant(1))

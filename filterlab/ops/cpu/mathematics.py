@@ -63,12 +63,12 @@ def log1p(e: Lanes, x: Value, ends: bool = True) -> Value:
 
 
 def power(e: Lanes, base: Value, exponent: Value) -> tuple[Value, Value]:
-    """base^exponent for base ≥ 0, exponent > 0, and log(base); 0 and 0 at base = 0.
+    """base^exponent for 0 ≤ base ≤ 1, exponent > 0, and log(base); 0 and 0 at base = 0. More than 1 is taken as 1.
 
     exp(exponent · log base): the error is relative to 1, not to the result; a highlight needs no more.
     """
     zero = e.builder.fcmp_ordered("==", base, e.constant(0))
-    logarithm = log(e, e.where(zero, e.constant(1), base), ends=False)
+    logarithm = e.minimum(e.constant(0), log(e, e.where(zero, e.constant(1), base), ends=False))  # NaN stays
     result = exp(e, e.multiply(exponent, logarithm))
     return e.where(zero, e.constant(0), result), logarithm
 

@@ -292,7 +292,7 @@ def _normal(tape: Tape, gradient: list[Node]) -> tuple[list[Node], Node]:
 
 
 def _power(tape: Tape, base: Node, exponent: Node) -> Node:
-    """base^exponent for base ≥ 0; 0 with derivative 0 at base = 0."""
+    """base^exponent for 0 ≤ base ≤ 1, more is rounding; 0 with derivative 0 at base = 0."""
     e = tape.lanes
     value, logarithm = mathematics.power(e, base.value, exponent.value)
     zero = e.builder.fcmp_ordered("==", base.value, e.constant(0))

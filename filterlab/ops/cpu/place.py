@@ -10,15 +10,17 @@ from torch import Tensor
 
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
-from filterlab.ops.cpu.folding import Job, Recipe
+from filterlab.ops.cpu.folding import LOST, TURNED, Job, Recipe
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, lanes_of, threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh
 from filterlab.ops.gather import readable
 from filterlab.ops.place import Placed, Placement
+from filterlab.ops.reference import place as reference
 from filterlab.volume import Boundary
 
 _POINTS_PER_THREAD = 4096  # fewer are not worth waking a thread for
+_TURNED, _LOST = {TURNED, TURNED | LOST}, {LOST, TURNED | LOST}
 
 
 def place(points: Tensor, placement: Placement) -> Placed:
@@ -52,16 +54,25 @@ class Placing:
         packs = -(-count // self.lanes)
         chunk = -(-packs // (threads * CHUNKS_PER_THREAD if threads > 1 else 1))
         chunks = -(-packs // chunk)
-        turned = (ctypes.c_int64 * chunks)()
+        met = (ctypes.c_int64 * chunks)()
         job = Job.from_buffer_copy(self.job)
-        job.points, job.located, job.turned = points.data_ptr(), located.data_ptr(), ctypes.addressof(turned)
+        job.points, job.located, job.met = points.data_ptr(), located.data_ptr(), ctypes.addressof(met)
         job.count, job.chunk, job.chunks = count, chunk, chunks
         pool.run(self.run, [job] * threads)
-        if not any(turned):
-            return located, None
-        sign = fresh(points.shape, self.dtype)
-        job.signs, job.next = sign.data_ptr(), 0
-        pool.run(self._program(signs=True), [job] * threads)
+        found, sign = set(met), None
+        if found & _TURNED:
+            sign = fresh(points.shape, self.dtype)
+            job.signs, job.next = sign.data_ptr(), 0
+            pool.run(self._program(signs=True), [job] * threads)
+        return self._with_lost(points, located, sign) if found & _LOST else (located, sign)
+
+    def _with_lost(self, points: Tensor, located: Tensor, sign: Tensor | None) -> Placed:
+        """The few points that are NaN or beyond the range of their type are left to the plain twin."""
+        if self.placement.geometry.is_identity:
+            return located, sign
+        rows = located.isnan().any(-1)
+        sign = torch.ones_like(located) if sign is None else sign
+        located[rows], sign[rows] = reference.place(points[rows], self.placement)
         return located, sign
 
 

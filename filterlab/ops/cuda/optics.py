@@ -153,9 +153,9 @@ def _normal(tape: Tape, gradient: list[Node]) -> list[Node]:
 
 
 def _power(tape: Tape, name: str, base: Node, exponent: Node) -> Node:
-    """base^exponent for base ≥ 0; 0 with derivative 0 at base = 0."""
+    """base^exponent for 0 ≤ base ≤ 1, more is rounding; 0 with derivative 0 at base = 0."""
     tape.source.line(f"known_{name} = tl.where({base} == 0.0, 1.0, {base})")
-    tape.source.line(f"logarithm_{name} = tl.log2(known_{name})")
+    tape.source.line(f"logarithm_{name} = tl.log2(tl.where(known_{name} > 1.0, 1.0, known_{name}))")
     return tape.record(
         name,
         f"tl.where({base} == 0.0, 0.0, tl.exp2(logarithm_{name} * {exponent}))",

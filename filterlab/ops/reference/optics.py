@@ -136,6 +136,10 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def power(base: Tensor, exponent: Tensor) -> Tensor:
-    """base^exponent for base ≥ 0, and 0 with derivative 0 at base = 0 (where 1 < exponent < 2 has no second one)."""
+    """base^exponent for 0 ≤ base ≤ 1, and 0 with derivative 0 at 0 (where 1 < exponent < 2 has no second one).
+
+    A cosine that is rounded to more than 1 is 1: a large exponent would make it infinite.
+    """
     positive = base != 0
+    base = base - (base.detach() - 1).clamp_min(0)
     return torch.where(positive, torch.where(positive, base, torch.ones_like(base)) ** exponent, torch.zeros_like(base))

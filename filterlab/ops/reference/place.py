@@ -2,17 +2,44 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from filterlab.ops.place import Placement
+from filterlab.volume import all_between
 
 
 def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
     """(located, sign), without the derivatives that `ops.differentiable.place` gives them."""
-    voxels = placement.geometry.to_voxel(points)
+    voxels = _voxels(points, placement)
     axes = [
         placement.boundary.fold(x, n, placement.tail) for x, n in zip(voxels.unbind(-1), placement.size, strict=True)
     ]
     located = torch.stack([x for x, _ in axes], -1)
     return located - placement.shift if placement.shift else located, torch.stack([s for _, s in axes], -1)
+
+
+def _voxels(points: Tensor, placement: Placement) -> Tensor:
+    """Voxel coordinates `(..., 3)`; those that would leave the range of their type by a period, or where they end."""
+    voxels = placement.geometry.to_voxel(points)
+    largest = torch.finfo(voxels.dtype).max
+    if placement.geometry.is_identity or all_between(voxels, -largest, largest):
+        return voxels
+    return torch.where(voxels.isfinite(), voxels, _far_voxels(points, placement))
+
+
+def _far_voxels(points: Tensor, placement: Placement) -> Tensor:
+    """The same by numbers that are small enough: matrix · (point − origin) / 2^k, and modulo period / 2^k is exact."""
+    geometry = placement.geometry
+    infinite = points.isinf()
+    ahead = geometry.direction_to_voxel(torch.where(infinite, points.sign(), 0))
+    power = max(math.frexp(max(sum(map(abs, row)) for row in geometry.inverse))[1] + 1, 1)
+    near = torch.where(infinite, 0, points) * 2.0**-power - points.new_tensor(geometry.origin) * 2.0**-power
+    near = geometry.direction_to_voxel(near)
+    periods = [placement.boundary.period(n) for n in placement.size]
+    if None not in periods:
+        near = near.fmod(points.new_tensor(periods) * 2.0**-power)
+    near = near * 2.0**power
+    return torch.where(ahead == 0, near, ahead * torch.inf + near)
