@@ -84,14 +84,14 @@ def first_call(methods: list[str]) -> dict[str, float]:
     """Seconds of the first value and gradient of each fused kernel, one after the other, and of another of the last."""
     import torch
 
+    from benchmarks.workloads import terms_of
     from filterlab import ops
-    from filterlab.methods import METHODS
 
     torch.set_num_threads(1)
     coefficients, points = torch.rand(1, 1, 8, 8, 8), torch.full((1, 16, 3), 3.5)
 
     def call(method: str) -> float:
-        (term,) = METHODS[method].value_terms
+        (term,) = terms_of(method)
         start = time.perf_counter()
         ops.jet(coefficients, points, term.kernels, 1, 0, "cpu")
         return time.perf_counter() - start

@@ -11,6 +11,9 @@ import math
 import torch
 from torch import Tensor
 
+from filterlab.fields.grid import Term
+from filterlab.methods import tensor_product
+
 MARGIN = 2.5
 OFF_GRID = 1e-3
 ARRANGEMENTS = ("coherent", "random")
@@ -47,3 +50,10 @@ def _along_rays(low: float, high: float, count: int) -> Tensor:
     across = start[:, None] + t[:, None] * slant
     along = (low + t * (high - low))[None, :, None].expand(rays, samples, 1)
     return torch.cat((across, along), -1).reshape(-1, 3)[:count].float().contiguous()
+
+
+def terms_of(method: str) -> tuple[Term, ...]:
+    """The separable terms of a tensor product's value."""
+    found = tensor_product(method)
+    assert found is not None, f"{method} is no tensor product"
+    return found.value_terms

@@ -100,6 +100,10 @@ class Method(ABC):
         Raises ValueError for a name or a combination that the method does not offer, with those it does.
         """
 
+    def gradient_of(self, scheme: str) -> str:
+        """The kind of gradient that a scheme gives when it is not told."""
+        return self.gradients[0]
+
     @abstractmethod
     def reach(self, prefilter: bool) -> int:
         """How far from a sample, in voxels, the field depends on it in float64."""
@@ -207,6 +211,9 @@ class TensorProduct(Method):
         if sampler != "exact":
             raise ValueError(f"sampler={sampler!r} needs scheme='eight_trilinear'; a sum over taps takes no samples")
         return Direct(self.value_terms, name or self.schemes[0], gradient or self.gradients[0])
+
+    def gradient_of(self, scheme: str) -> str:
+        return self.sampled_gradient if scheme == "eight_trilinear" else self.gradients[0]
 
     def reach(self, prefilter: bool) -> int:
         return self.kernel.support + (self.prefilter.decay(torch.float64) if prefilter else 0)

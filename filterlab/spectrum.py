@@ -76,7 +76,7 @@ def measured_response(
     samples = torch.zeros(1, 1, 2 * reach + 1, dtype=torch.float64, device=omega.device)
     samples[..., reach] = 1
     volume = samples.expand(3, 3, -1)
-    gradient = getattr(method, "sampled_gradient", None) if scheme == "eight_trilinear" else None
+    gradient = None if scheme is None else method.gradient_of(scheme)
     field = reconstruct(volume, method, boundary=Boundary.WRAP, prefilter=prefilter, scheme=scheme, gradient=gradient)
     x, weights = _half_voxel_quadrature(2 * reach, omega.device)
     impulse = _mean_over_a_voxel(field, x + reach)

@@ -14,7 +14,7 @@ from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_i
 from benchmarks.records import Bar, at_most, below
 from benchmarks.settings import Settings
 from filterlab import ops
-from filterlab.methods import METHODS, reconstruct
+from filterlab.methods import reconstruct
 
 CHECKED = 20_000  # points at which numbers are compared with the plain sum
 _POINTS_BAR, _SPLAT_BAR = at_most("1.3"), at_most("2.2")
@@ -37,7 +37,7 @@ _PAIRS = {
 
 def _adjoints(settings: Settings, method: str, arrangement: str) -> Race:
     """Forward: `ops.jet` of order 1. Gradient to points: its backward pass, every row weighted. Splat: its adjoint."""
-    (term,) = METHODS[method].value_terms
+    (term,) = workloads.terms_of(method)
     volume = workloads.noise(settings.voxels)[None, None]
     where = workloads.points(arrangement, settings.voxels, settings.points)[None]
     weights = torch.randn(1, 1, 4, where.shape[1], generator=torch.Generator().manual_seed(2))

@@ -7,7 +7,6 @@ from benchmarks.comparisons.jets import op_contestant
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, Tick, race_item, run_race
 from benchmarks.records import Figure, Outcome, Spread, Timing, at_least
 from benchmarks.settings import Settings
-from filterlab.methods import METHODS
 
 _BARS = {"triquadratic": at_least("0.5"), "tricubic": at_least("0.7")}
 _KERNELS = {"triquadratic": 3, "tricubic": 4}
@@ -37,7 +36,7 @@ def _rate(timing: Timing) -> Figure:
 
 def _share(settings: Settings, name: str) -> Race:
     support = _KERNELS[name]
-    (kernel, *_) = METHODS[name].value_terms[0].kernels
+    (kernel, *_) = workloads.terms_of(name)[0].kernels
     alone, whole = floor.sums(support), floor.sums(support) + floor.weights(kernel)  # type: ignore[arg-type]
     where = workloads.points("coherent", settings.voxels, settings.points)
     contestants = [

@@ -46,7 +46,7 @@ def op_contestant(
     method: str, scheme: str, volume: Tensor, where: Tensor, computes: str | None = "value and gradient of the op"
 ) -> Contestant:
     """`ops.jet` of order 1 of a method's kernel on bare coefficients: no boundary, no folding."""
-    (term,) = METHODS[method].value_terms
+    (term,) = workloads.terms_of(method)
     coefficients, located = volume[None, None], where[None]
 
     def call() -> Tensor:
@@ -57,9 +57,8 @@ def op_contestant(
 
 def schemes_of(method: str, gradient: str | None) -> Sequence[str]:
     """The schemes that give a method that kind of gradient, the fused one first."""
-    m = METHODS[method]
-    sampled = m.sampled is not None and (gradient or m.gradients[0]) == m.sampled_gradient
-    return ("fused", "direct", "eight_trilinear") if sampled else ("fused", "direct")
+    m, kind = METHODS[method], gradient or METHODS[method].gradients[0]
+    return [s for s in m.schemes if s in ("fused", "direct") or m.gradient_of(s) == kind]
 
 
 def _race(settings: Settings, case: str, arrangement: str) -> Race:
@@ -70,7 +69,7 @@ def _race(settings: Settings, case: str, arrangement: str) -> Race:
     contestants = [field_contestant(method, s, volume, where, gradient=gradient) for s in schemes]
     bar = _BARS.get(f"{case}-{arrangement}")
     ratios = [Ratio("fused", other, bar if other == "direct" else None) for other in schemes[1:]]
-    if len(METHODS[method].value_terms) == 1 and gradient is None:
+    if len(workloads.terms_of(method)) == 1 and gradient is None:
         contestants += [op_contestant(method, s, volume, where) for s in ("fused", "direct")]
         ratios.append(Ratio("op fused", "op direct", bar))
     kind = f"{gradient or METHODS[method].gradients[0]} gradient"

@@ -24,7 +24,6 @@ import filterlab as fl
 from experiments.extremes.contract import Case, Finding, Subject, Tally
 from experiments.extremes.coordinates import largest
 from filterlab.fields.grid import GridField
-from filterlab.fields.tensor_product import reach_of
 from filterlab.kernels import bspline
 from filterlab.ops import Stencil, gather
 from filterlab.ops.cpu.gather import Program, scatter
@@ -61,7 +60,7 @@ def vast_and_corner() -> tuple[Tensor, Tensor] | str:
 
 def field_over(subject: Subject, coefficients: Tensor, first: int) -> GridField:
     """The subject's field of given coefficients as they lie, the first of them at `first` along every axis."""
-    gradient = fl.METHODS[subject.method].sampled_gradient if subject.scheme == "eight_trilinear" else None
+    gradient = fl.METHODS[subject.method].gradient_of(subject.scheme)
     few = torch.zeros((8, 8, 8), dtype=torch.uint8)
     built = fl.reconstruct(few, subject.method, scheme=subject.scheme, gradient=gradient, prefilter=False)
     assert isinstance(built, GridField)
@@ -79,7 +78,7 @@ def many_voxels(subject: Subject, random: np.random.Generator, amount: float) ->
         return Finding(0, 0.0, 0.0, skipped=made)
     vast, corner = made
     count = max(int(2000 * amount), 100)
-    margin = reach_of(fl.METHODS[subject.method].value_terms) + 2
+    margin = fl.METHODS[subject.method].reach(prefilter=False) + 1
     points = random.integers(64 * margin, 64 * (CORNER - margin), (count, 3)) / 64.0  # float32 holds them exactly
     near = torch.tensor(points, dtype=torch.float32)
     tally = Tally(2e-6)

@@ -36,7 +36,7 @@ def field_of(subject: Subject, samples: Tensor | fl.Volume | None = None, **opti
         subject.method,
         boundary=subject.boundary,
         scheme=subject.scheme,
-        gradient=fl.METHODS[subject.method].sampled_gradient if subject.scheme == "eight_trilinear" else None,
+        gradient=fl.METHODS[subject.method].gradient_of(subject.scheme),
         storage=options.get("storage"),
         nan=options.get("nan", "refuse"),
     )

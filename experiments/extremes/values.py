@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import filterlab as fl
 from experiments.extremes.contract import Case, Finding, Subject, Tally
 from experiments.extremes.coordinates import SWEEP, field_of, largest, points_inside, refusal, samples_on
 from filterlab.fields.storage import STORAGE
 from filterlab.fields.tensor_product import Direct
+from filterlab.methods import tensor_product
 from filterlab.render.bricks import bound
 
 ROUNDING = 2.0**-24
@@ -130,7 +130,9 @@ def short_storage(subject: Subject, random: np.random.Generator, amount: float) 
 
 def _norm(subject: Subject) -> float:
     """The largest Σ |w| of the weights of a value."""
-    stencil = Direct(fl.METHODS[subject.method].value_terms).stencils[0]
+    method = tensor_product(subject.method)
+    assert method is not None, "only tensor products are sums of weights"
+    stencil = Direct(method.value_terms).stencils[0]
     return bound(stencil.lowered)[2]
 
 

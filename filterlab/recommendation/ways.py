@@ -29,8 +29,7 @@ def ways_of(method: Method, dtype: torch.dtype, all_of_them: bool) -> Iterator[W
     yield method.name, first, None
     if all_of_them:
         for scheme in method.schemes:
-            own = scheme != "eight_trilinear" or method.sampled_gradient == method.gradients[0]
-            if own and scheme != first:
+            if scheme != first and method.gradient_of(scheme) == method.gradients[0]:
                 yield method.name, scheme, None
         for storage in STORAGE:
             yield method.name, first, storage
