@@ -11,7 +11,9 @@ third and higher derivatives of a value-and-gradient jet).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Protocol
 
 import torch
@@ -171,6 +173,27 @@ class Scatter(torch.autograd.Function):
         g = cotangents.expand(b, *cotangents.shape) if cotangent_dim is None else cotangents.movedim(cotangent_dim, 0)
         out = scatter(g.flatten(0, 1), p.flatten(0, 1), stencil, shape, *rest)
         return out.unflatten(0, (b, p.shape[1])), 0
+
+
+_modes = threading.local()  # in its list, one mark for everybody who has changed the grad mode
+
+
+@contextmanager
+def differentiating(on: bool) -> Iterator[None]:
+    """torch's grad mode, put back in any case.
+
+    `torch.no_grad` leaves it off for good when Ctrl-C comes between its first line and the block. This generator, left
+    behind there, is closed with the exception; and whoever is around it has put the mode back by then, marks included.
+    """
+    before, mark, marks = torch.is_grad_enabled(), object(), _modes.__dict__.setdefault("marks", [])
+    try:
+        marks.append(mark)
+        torch._C._set_grad_enabled(on)
+        yield
+    finally:
+        if mark in marks:
+            torch._C._set_grad_enabled(before)
+            del marks[marks.index(mark) :]
 
 
 def plain(*tensors: Tensor) -> bool:

@@ -14,14 +14,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from filterlab import forking
 from filterlab.ops import cpu, cuda
+from filterlab.ops.autograd import differentiating
 from filterlab.ops.derivatives import GRADIENTS, TABLE_ROW, by_name, columns_of_rays
 from filterlab.ops.fused import STORAGE
 from filterlab.ops.stencil import Stencil
@@ -170,7 +172,6 @@ class March:
     step: float
     faint: float = 0.0
     bricks: Bricks | None = None
-    _kept: list[object] = field(default_factory=list, repr=False)  # what jobs point to
 
     @property
     def dtype(self) -> torch.dtype:
@@ -191,7 +192,7 @@ class March:
         """The coefficients as they are read."""
         return self.coefficients.detach().resolve_neg().contiguous()
 
-    @torch.no_grad()
+    @differentiating(False)
     def run(self, report: Callable[[int], None] = lambda rays: None) -> tuple[Tensor, Tensor]:
         """Light (R, 3) and optical depth (R,), float64. `report` is given the number of rays done, now and then."""
         if on_gpu(self.coefficients):
@@ -206,7 +207,7 @@ class March:
             self._launch((), job, report)
         return light, depth
 
-    @torch.no_grad()
+    @differentiating(False)
     def adjoint(
         self,
         light: Tensor,
@@ -250,10 +251,11 @@ class March:
             volumes = [cpu._zeros((1, *self.coefficients.shape), self.dtype)[0] for _ in range(threads)]
         if rays:
             job = self._job(gradients, ray_gradient=by_ray, **arrays)
-            own = [_copy(job) for _ in range(threads)]
+            own = [job.copy() for _ in range(threads)]
             for i, one in enumerate(own):
-                one.table_gradient = tables[i].data_ptr()
-                one.coefficient_gradient = volumes[i].data_ptr() if volumes else None
+                one.point(table_gradient=tables[i])
+                if volumes:
+                    one.point(coefficient_gradient=volumes[i])
             self._launch_parts(gradients, own, report)
         for part in volumes[1:]:
             volumes[0] += part
@@ -272,7 +274,8 @@ class March:
     # --- jobs ---
 
     def _job(self, gradients: tuple[str, ...], **arrays: Tensor) -> Job:
-        from filterlab.ops.cpu import march
+        with forking.lock:
+            from filterlab.ops.cpu import march
 
         d, h, w = self.coefficients.shape
         job = march.Job(
@@ -305,10 +308,7 @@ class March:
             job.slack = self.slack
             for axis, count in zip(march.AXES, self.bricks.distance.shape[::-1], strict=True):
                 setattr(job, f"bricks_{axis}", count)
-        for name, tensor in inputs.items():
-            tensor = tensor.detach().resolve_neg().contiguous()
-            self._kept.append(tensor)
-            setattr(job, name, tensor.data_ptr())
+        job.point(**{name: tensor.detach().resolve_neg().contiguous() for name, tensor in inputs.items()})
         return job
 
     def _lit(self) -> dict[str, Tensor]:
@@ -366,10 +366,6 @@ class March:
             cpu.has_room(self._readable),
             cpu._lanes(compiler.features(), self.dtype.itemsize),
         )
-
-
-def _copy(job: Job) -> Job:
-    return type(job).from_buffer_copy(job)
 
 
 def _way_to_intervals(steps: Steps | None) -> str:

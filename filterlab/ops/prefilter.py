@@ -18,6 +18,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from filterlab import forking
 from filterlab.ops import cpu
 from filterlab.ops.autograd import plain
 from filterlab.ops.fused import STORAGE
@@ -212,7 +213,8 @@ def _fused(samples: Tensor, *settings) -> Tensor:
 
 
 def _compute(samples: Tensor, dims: tuple[int, ...], prefilter: Prefilter, boundary: Boundary, tail: int) -> Tensor:
-    from filterlab.ops.cpu import prefilter as fused  # it needs llvmlite
+    with forking.lock:
+        from filterlab.ops.cpu import prefilter as fused  # it needs llvmlite
 
     return fused.filter_axes(samples, dims, prefilter, boundary, tail)
 

@@ -24,6 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 from filterlab.fields.base import Domain, Field
 from filterlab.fields.grid import GridField
+from filterlab.ops.autograd import differentiating
 from filterlab.render.camera import Camera, check_size
 from filterlab.render.fused import FusedMarcher, why_not_fused
 from filterlab.render.plain import Chords, Marcher, Medium, PlainMarcher, rays_at_once
@@ -169,7 +170,7 @@ def prepare(
     media = [Medium(one, transfer, shading, length, faint, differentiable) for one in _unbatched(field)]
     cut = _Cut(field.domain, box, length, asked / length, jitter_seed, differentiable)
     marcher, at_once = _marcher(media[0], memory)
-    with torch.set_grad_enabled(differentiable):
+    with differentiating(differentiable):
         parts: Sequence[Tensor | Chords] = view.pixels.split(at_once)
         if len(view.pixels) * _BYTES_PER_RAY <= memory:  # else rays are cut again for every image
             parts = [cut(view, pixels) for pixels in parts]
@@ -208,7 +209,7 @@ class Job:
     def run(self, progress: Progress = False) -> Tensor:
         """The image, as `render` gives it."""
         with (
-            torch.set_grad_enabled(self.media[0].differentiable),
+            differentiating(self.media[0].differentiable),
             _reporting(progress, self.samples) as report,
         ):
             done, parts = 0, []
@@ -328,7 +329,7 @@ class _Cut:
             return torch.ones_like(pixels, dtype=torch.float64)
         return (self.stretch * jitter(self.jitter_seed, pixels)).clamp_max(1)
 
-    @torch.no_grad()
+    @differentiating(False)
     def count_all(self, view: _View, parts: Sequence[Tensor | Chords], images: int, limit: int) -> int:
         """How many samples the images take; parts of them are pixels or rays. Raises ValueError above `limit`."""
         total = 0.0

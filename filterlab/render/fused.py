@@ -17,6 +17,7 @@ from torch.autograd import forward_ad
 from filterlab.fields.grid import GridField
 from filterlab.fields.tensor_product import Direct
 from filterlab.ops import march
+from filterlab.ops.autograd import differentiating
 from filterlab.ops.march import Bricks
 from filterlab.ops.stencil import Stencil
 from filterlab.render.bricks import bricks_of
@@ -211,7 +212,7 @@ def _derivatives(
 ) -> list[Tensor | None]:
     """By the fused adjoint, and from what was prepared for it back to the parameters by autograd."""
     wanted = given.wanted(needed)
-    with torch.enable_grad():
+    with differentiating(True):
         leaves = [p.detach().requires_grad_(need) for p, need in zip(parameters, needed, strict=True)]
         medium, chords = given.rebuilt(leaves)
         # where opacity is 0 it changes with the control points nevertheless

@@ -16,6 +16,7 @@ import torch
 from filterlab.costs import Quartiles, coefficient_bytes
 from filterlab.fields.grid import GridField
 from filterlab.methods import METHODS
+from filterlab.ops.autograd import differentiating
 from filterlab.render.dvr import Job, prepare
 from filterlab.render.fused import FusedMarcher, empty_bricks, why_not_fused
 from filterlab.render.plain import Chords, Medium
@@ -82,7 +83,7 @@ def plan(prepared: Prepared) -> Plan:
 
     Takes as long as a few thousand rays do, five times over.
     """
-    with torch.no_grad():
+    with differentiating(False):
         job = prepare(prepared.field, prepared.camera, prepared.transfer, **prepared.options)
         medium, some = job.media[0], _some_rays(job)
         seconds = _seconds(job, medium, some)

@@ -24,14 +24,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from filterlab import forking
 from filterlab.ops.fused import MAX_ORDER as MAX_ORDER
 from filterlab.ops.fused import STORAGE, readable, unsupported
 from filterlab.ops.stencil import Stencil
 from filterlab.volume import Boundary
 
 if TYPE_CHECKING:
-    from filterlab.ops.cpu.job import Job
     from filterlab.ops.cpu.order import Sorted
+    from filterlab.ops.cpu.points import Job
     from filterlab.ops.placement import Placement
 
 FEWEST_SORTED = 1 << 16  # points of a batch entry
@@ -42,6 +43,7 @@ _ARITHMETIC = {torch.float32: "float32", torch.float64: "float64"}
 _COORDINATES = {torch.float32: 1 << 24, torch.float64: 1 << 28}  # exact in the dtype; 8 times it fits 32 bits
 _POINTS_PER_THREAD = 4096  # fewer are not worth waking a thread for
 _CHUNKS_PER_THREAD = 16  # so that a thread that is held up leaves its share to the others
+_MOST_POINTS = 1 << 16  # of a chunk, times channels: between two of them Ctrl-C is heard
 
 
 def missing(
@@ -75,7 +77,11 @@ def missing(
 @lru_cache
 def _llvmlite_problem() -> str | None:
     try:
-        import llvmlite.binding  # noqa: F401
+        with forking.lock:  # what the first call needs, whole
+            import filterlab.ops.cpu.compiler
+            import filterlab.ops.cpu.folding
+            import filterlab.ops.cpu.points
+            import filterlab.ops.cpu.threads  # noqa: F401
     except (ImportError, OSError) as error:
         return f"the package llvmlite can't be loaded ({error}); pip install llvmlite"
     return None
@@ -160,7 +166,8 @@ def _sorting_pays(points: Tensor, shape: Sequence[int], bytes_each: int) -> bool
     """Whether sorting points (N, M, 3) costs less than it saves (`order`); nothing is imported where it can't."""
     if points.shape[1] < FEWEST_SORTED or math.prod(shape[2:]) * bytes_each < SMALLEST_SORTED_IN:
         return False
-    from filterlab.ops.cpu import order
+    with forking.lock:
+        from filterlab.ops.cpu import order
 
     return order.scattered(points)
 
@@ -192,18 +199,11 @@ def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor | None]:
     count = points.numel() // 3
     threads = max(1, min(torch.get_num_threads(), count // _POINTS_PER_THREAD))
     packs = -(-count // lanes)
-    chunk = -(-packs // (threads * _CHUNKS_PER_THREAD if threads > 1 else 1))
+    chunk = min(-(-packs // (threads * _CHUNKS_PER_THREAD if threads > 1 else 1)), _MOST_POINTS // lanes)
     chunks = -(-packs // chunk)
     turned = np.zeros(chunks, np.int64)
-    job = folding.Job(
-        points=points.data_ptr(),
-        located=located.data_ptr(),
-        turned=turned.ctypes.data,
-        count=count,
-        chunk=chunk,
-        chunks=chunks,
-        shift=placement.shift,
-    )
+    job = folding.Job(count=count, chunk=chunk, chunks=chunks, shift=placement.shift)
+    job.point(points=points, located=located, turned=turned)
     for i, (a, n) in enumerate(zip(AXES, placement.size, strict=True)):
         setattr(job, f"origin_{a}", geometry.origin[i])
         low, high = placement.boundary.interval(n, placement.tail)
@@ -223,7 +223,7 @@ def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor | None]:
     if not turned.any():
         return located, None
     sign = _fresh(points.shape, points.dtype, np.empty)
-    job.signs = sign.data_ptr()
+    job.point(signs=sign)
     run(True)
     return located, sign
 
@@ -284,8 +284,8 @@ def _run(
     """
     from filterlab.ops.cpu import compiler
     from filterlab.ops.cpu import threads as pool
-    from filterlab.ops.cpu.job import AXES, Job
-    from filterlab.ops.cpu.points import BLOCK, Recipe
+    from filterlab.ops.cpu.job import AXES
+    from filterlab.ops.cpu.points import BLOCK, Job, Recipe
 
     coefficients, threads = volumes[0], len(volumes)
     assert all(t.data_ptr() for t in (*volumes, points, rows)), "tensors without memory"
@@ -296,15 +296,13 @@ def _run(
     entries, count = points.shape[:2]
     packs = -(-count // lanes)
     shared = operation != "scatter"
-    chunk = -(-packs // (threads * _CHUNKS_PER_THREAD if shared and threads > 1 else threads))
-    chunk = -(-chunk // BLOCK) * BLOCK
+    blocks = -(-packs // ((threads * _CHUNKS_PER_THREAD if shared and threads > 1 else threads) * BLOCK))
+    most = max(1, _MOST_POINTS // (lanes * BLOCK * coefficients.shape[1]))
+    cuts = 1 if blocks <= most else -(-blocks // most) if shared else _least_divisor(blocks, -(-blocks // most))
+    chunk = -(-blocks // cuts) * BLOCK
     parts = -(-packs // chunk)  # of every batch entry
     d, h, w = coefficients.shape[2:]
     job = Job(
-        coefficients=coefficients.data_ptr(),
-        points=points.data_ptr(),
-        rows=rows.data_ptr(),
-        gradient=None if gradient is None else gradient.data_ptr(),
         channels=coefficients.shape[1],
         count=count,
         width=w,
@@ -321,17 +319,28 @@ def _run(
     for axis, size, support in zip(AXES, (w, h, d), stencil.supports, strict=True):
         setattr(job, f"low_{axis}", start)
         setattr(job, f"high_{axis}", start + size - support)
-    pool.run(function, [job] * threads if shared else [_own_share(job, i, v) for i, v in enumerate(volumes[:parts])])
+    job.point(points=points, rows=rows)
+    if gradient is not None:
+        job.point(gradient=gradient)
+    if shared:
+        job.point(coefficients=coefficients)
+        pool.run(function, [job] * threads)
+    else:
+        shares = range(0, parts, cuts)
+        pool.run(function, [_own_share(job, first, cuts, v) for first, v in zip(shares, volumes, strict=False)])
 
 
-def _own_share(job: Job, part: int, volume: Tensor) -> Job:
-    """The job of adding one part of every batch entry's points to a volume of its own."""
-    from filterlab.ops.cpu.job import Job
-
-    own = Job.from_buffer_copy(job)
-    own.coefficients = volume.data_ptr()
-    own.next, own.chunks = part * job.entries, (part + 1) * job.entries
+def _own_share(job: Job, first: int, parts: int, volume: Tensor) -> Job:
+    """The job of adding some parts of every batch entry's points to a volume of its own."""
+    own = job.copy()
+    own.point(coefficients=volume)
+    own.next, own.chunks = first * job.entries, min((first + parts) * job.entries, job.chunks)
     return own
+
+
+def _least_divisor(number: int, least: int) -> int:
+    """The least divisor of a number from `least` on: shares that are cut into equal parts end where they ended."""
+    return next(cuts for cuts in range(least, number + 1) if number % cuts == 0)
 
 
 def _lanes(features: frozenset[str], element_size: int) -> int:

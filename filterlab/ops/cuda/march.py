@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from filterlab.ops.autograd import differentiating
 from filterlab.ops.cuda import optics
 from filterlab.ops.cuda.optics import RGB
 from filterlab.ops.cuda.program import Program, launch
@@ -68,7 +69,7 @@ class _March(Program):
         self.line("tl.store(optical_depth + ray, passed, inside)")
 
 
-@torch.no_grad()
+@differentiating(False)
 def run(march: March, report: Callable[[int], None] = lambda rays: None) -> tuple[Tensor, Tensor]:
     """`ops.march.March.run` on the device of its tensors: light (R, 3) and optical depth (R,), float64."""
     rays, device = march.rays.count.shape[0], march.coefficients.device
