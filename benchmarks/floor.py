@@ -122,7 +122,7 @@ def _call(program: Program, buffer: Tensor, steps: int, times: int) -> Callable[
     job = Job(buffer.data_ptr(), steps, times)
 
     def call() -> Tensor:
-        function(ctypes.addressof(job))
+        function(ctypes.addressof(job), 0, 1)
         return buffer
 
     return call

@@ -1,7 +1,10 @@
-"""Fixtures for every test: one thread (the arrays are small), fixed seeds, and nothing written outside tmp_path."""
+"""For every test: one thread (the arrays are small), fixed seeds, and nothing written outside temporary folders."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import tempfile
 import warnings
 
 import numpy as np
@@ -13,6 +16,19 @@ with warnings.catch_warnings():  # torch's own forward mode compiles these with 
     import torch._decomp.decompositions_for_jvp
 
 torch.set_num_threads(1)
+
+_BY_A_WORKER = "PYTEST_XDIST_WORKER" in os.environ
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compiled programs go to a folder of this run, which its workers and the processes of its tests share."""
+    if not _BY_A_WORKER:
+        os.environ["FILTERLAB_CACHE"] = tempfile.mkdtemp(prefix="filterlab-tests-")
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if not _BY_A_WORKER:
+        shutil.rmtree(os.environ.pop("FILTERLAB_CACHE", ""), ignore_errors=True)
 
 
 @pytest.fixture(autouse=True)

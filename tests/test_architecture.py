@@ -18,6 +18,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 # each room may import the rooms before it (and itself); the same number: neither imports the other
 FLOORS = {
+    "forking": 0,
     "volume": 0,
     "kernels": 0,
     "prefilters": 1,

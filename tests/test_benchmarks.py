@@ -368,10 +368,10 @@ def test_probes_measure_in_this_process_too():
 
 
 def test_a_probe_runs_in_a_process_of_its_own(tmp_path):
-    cache = tmp_path / "kernels"
+    cache = tmp_path / "programs"
     found = probe.measured("first_call", {"FILTERLAB_CACHE": str(cache)}, methods=["trilinear"])
     assert found["trilinear"] > 0
-    assert list(cache.iterdir()), "the kernel was compiled there"
+    assert list(cache.iterdir()), "the program was compiled there"
 
 
 def test_a_probe_that_fails_says_why():

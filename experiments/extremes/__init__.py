@@ -11,7 +11,7 @@ from importlib import import_module
 
 from experiments.extremes.contract import Case
 
-_MODULES = ("coordinates", "values", "shapes", "addressing", "rendering", "configs", "files", "runs")
+_MODULES = ("coordinates", "values", "shapes", "addressing", "rendering", "configs", "files", "runs", "processes")
 
 
 def _collected() -> dict[str, Case]:

@@ -58,11 +58,11 @@ def bricks_of(
         edge = fine if coefficients.numel() >> 3 * fine <= _MOST_FINE else coarse
     volume = _volume(coefficients, stencil.supports, edge)
     asked = stencil.lowered, _what_is_clear(transfer)
-    if volume.asked != asked:
+    if volume.answer[0] != asked:
         empty = transparent(*values(*volume.ranges, stencil.lowered, transfer.positions.dtype), transfer)
-        volume.bricks = Bricks(distances(empty), edge) if bool(empty.any()) else None
-        volume.asked = asked
-    return volume.bricks
+        found = Bricks(distances(empty), edge) if bool(empty.any()) else None
+        volume.answer = asked, found  # both or, cut off in between, neither
+    return volume.answer[1]
 
 
 def _what_is_clear(transfer: TransferFunction) -> tuple[object, ...]:
@@ -81,13 +81,11 @@ class _Volume:
     Attributes:
         ranges: smallest and largest coefficient that every brick's cells read: (bz, by, bx) float64 each; NaN where
             one is.
-        asked: of whom `bricks` are: camera and lights change more often than what is transparent.
-        bricks: see `bricks_of`.
+        answer: what was asked last, and the bricks: camera and lights change more often than what is transparent.
     """
 
     ranges: tuple[Tensor, Tensor]
-    asked: object = None
-    bricks: Bricks | None = None
+    answer: tuple[object, Bricks | None] = (None, None)
 
 
 _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Domain
+from filterlab.ops.differentiable.recording import differentiating
 
 Vector = Sequence[float] | Tensor
 Window = tuple[float, float, float, float]
@@ -51,7 +52,7 @@ class Camera(ABC):
         for name in ("position", "target", "up"):
             _check_vector(name, getattr(self, name))
         check_window(self.window)
-        with torch.no_grad():
+        with differentiating(False):
             _basis(*(_vector(v).cpu() for v in (self.position, self.target, self.up)))
 
     @property

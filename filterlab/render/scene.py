@@ -31,6 +31,7 @@ from filterlab.io.config import StrictModel, load_config, unknown_name
 from filterlab.io.volumes import describe, load_volume
 from filterlab.methods import METHODS, reconstruct
 from filterlab.missing_values import NanChoice
+from filterlab.ops.differentiable.recording import differentiating
 from filterlab.recommendation import recommend, report
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
 from filterlab.render.dvr import Progress, render
@@ -511,7 +512,7 @@ def render_scene(scene: Scene, progress: Progress = False) -> Tensor:
 
     For its opacity as well: `build(scene).render()`.
     """
-    with torch.no_grad():
+    with differentiating(False):
         return build(scene).render(progress)[..., :3]
 
 

@@ -34,7 +34,8 @@ def opened(folder, **changes):
 
 # Units that take a while: killed in the middle, resumed, and never done twice.
 SLOW = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the background inherits that it is ignored
 from experiments import registry, __main__
 from experiments.report.page import Section
 from tests.experiments.test_runs import Config

@@ -48,7 +48,7 @@ def on_packs(name: str, x: np.ndarray) -> np.ndarray:
     assert x.size % 8 == 0
     out = np.empty_like(x)
     job = (ctypes.c_int64 * 3)(x.ctypes.data, out.ctypes.data, x.size)
-    compiler.compiled(OnPacks(name, str(x.dtype)))(ctypes.addressof(job))
+    compiler.compiled(OnPacks(name, str(x.dtype)))(ctypes.addressof(job), 0, 1)
     return out
 
 

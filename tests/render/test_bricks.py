@@ -22,13 +22,6 @@ LIT = Shading((Light((1.0, -2.0, 1.0)), Light()), ambient=0.3)
 PEAK = TransferFunction.triangle_peaks([(0.5, 0.2, 0.6, (0.2, 0.4, 1.0))], unit=2.0)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _own_cache(tmp_path_factory: pytest.TempPathFactory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FILTERLAB_CACHE", str(tmp_path_factory.mktemp("kernels")))
-        yield
-
-
 def ball(shape=(23, 19, 30)) -> Tensor:
     """1 inside, falling to 0: nearly all of it is flat."""
     axes = [torch.arange(n, dtype=torch.float64) - n / 2.3 for n in shape]

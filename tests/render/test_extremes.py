@@ -27,13 +27,6 @@ some = settings(deadline=None, max_examples=50)
 few = settings(deadline=None, max_examples=15)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _own_cache(tmp_path_factory: pytest.TempPathFactory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FILTERLAB_CACHE", str(tmp_path_factory.mktemp("kernels")))
-        yield
-
-
 samples = torch.rand(N, N, N, generator=torch.Generator().manual_seed(3))
 
 

@@ -30,13 +30,6 @@ TYPED = [(*kind, (torch.float32, torch.float64)[i % 2]) for i, kind in enumerate
 TYPED += [("triquadratic", "analytic", torch.float32), ("ncrsi", "central", torch.float64)]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _own_cache(tmp_path_factory: pytest.TempPathFactory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FILTERLAB_CACHE", str(tmp_path_factory.mktemp("kernels")))
-        yield
-
-
 def samples(dtype: torch.dtype = torch.float32, shape=(9, 12, 10)) -> Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
 

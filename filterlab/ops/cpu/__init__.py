@@ -18,6 +18,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from filterlab import forking
 from filterlab.ops.gather import unsupported
 from filterlab.ops.stencil import Stencil
 
@@ -56,7 +57,8 @@ def missing(
 def llvmlite_problem() -> str | None:
     """Why no program can be compiled here; None: they can."""
     try:
-        import llvmlite.binding  # noqa: F401
+        with forking.lock:  # what the first call needs, whole
+            import filterlab.ops.cpu.evaluation  # noqa: F401
     except (ImportError, OSError) as error:
         return f"the package llvmlite can't be loaded ({error}); pip install llvmlite"
     return None

@@ -1,26 +1,37 @@
 """From a recipe to a function that can be called: LLVM through llvmlite, with the result kept on disk.
 
-Compiling takes a few tenths of a second, loading a few milliseconds. What a stored kernel is found by contains all that
-it depends on: the recipe, the text of this package, LLVM's version, the machine.
+Compiling takes a few tenths of a second, loading a few milliseconds. What a stored program is found by contains all
+that it depends on: the recipe, the text of `SOURCES`, LLVM's version, the machine.
+
+LLVM is only used aside (`threads`), one program after the other. There nothing can interrupt it, so that no lock of
+LLVM's is left locked and no program is half there; who is interrupted while waiting finds it made the next time. A fork
+and the end of Python wait until LLVM is at rest.
 """
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import ctypes
 import hashlib
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from functools import cache
 from importlib import resources
-from threading import RLock
-from typing import Protocol
+from importlib.resources.abc import Traversable
+from typing import Protocol, TypeVar
 
 from llvmlite import binding as llvm
 
+from filterlab import forking
 from filterlab.ops.cpu import cache as disk
+from filterlab.ops.cpu import threads
 from filterlab.ops.cpu.frame import ENTRY
+from filterlab.ops.cpu.job import Function
 
-Function = Callable[[int], None]
-"""Takes the address of a `Job` and works until its chunks are used up; lets other Python threads run meanwhile."""
+SOURCES = ("ops", "kernels.py", "prefilters.py", "volume.py")
+"""Files and folders of filterlab that a program depends on: everything that `ops` imports (a test checks it)."""
+
+_Result = TypeVar("_Result")
 
 
 class Recipe(Hashable, Protocol):
@@ -31,38 +42,61 @@ class Recipe(Hashable, Protocol):
         ...
 
 
-_lock = RLock()
-_engines: list[llvm.ExecutionEngine] = []  # they own the machine code
+_programs: dict[Recipe, Function] = {}
+_signature = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 
 
 def compiled(recipe: Recipe) -> Function:
-    """The kernel of a recipe: from memory, from disk, or compiled now."""
-    with _lock:  # two threads asking for one kernel compile it once
-        return _compiled(recipe)
+    """The program of a recipe: from memory, from disk, or compiled now."""
+    found = _programs.get(recipe)
+    return found or _with_llvm(lambda: _made(recipe))
 
 
-@cache
-def _compiled(recipe: Recipe) -> Function:
-    name = hashlib.sha256(repr((recipe, _surroundings())).encode()).hexdigest()[:40] + ".o"
-    code = disk.read(name)
-    if code is None:
-        code = _compile(recipe)
-        disk.write(name, code)
-    return _load(code)
+def _with_llvm(use: Callable[[], _Result]) -> _Result:
+    def alone() -> _Result:
+        with forking.gate:
+            pass
+        with forking.lock:
+            return use()
+
+    return threads.aside(alone)
+
+
+def _made(recipe: Recipe) -> Function:
+    if recipe not in _programs:  # two threads that ask for one program make it once
+        name = hashlib.sha256(repr((recipe, _surroundings())).encode()).hexdigest()[:40] + ".o"
+        code = disk.read(name)
+        if code is None:
+            code = _compile(recipe)
+            disk.write(name, code)
+        _programs[recipe] = _load(code)
+    return _programs[recipe]
 
 
 @cache
 def features() -> frozenset[str]:
     """What this processor can do, in LLVM's words: "avx2", "fma", "neon", …"""
-    return frozenset(name for name, present in llvm.get_host_cpu_features().items() if present)
+    return _with_llvm(lambda: frozenset(name for name, present in llvm.get_host_cpu_features().items() if present))
 
 
 @cache
 def _surroundings() -> tuple[object, ...]:
-    sources = [s for s in resources.files("filterlab.ops.cpu").iterdir() if s.name.endswith(".py")]
-    text = b"".join(source.read_bytes() for source in sorted(sources, key=lambda s: s.name))
-    cpu = llvm.get_host_cpu_name(), sorted(features()), llvm.get_process_triple()
-    return hashlib.sha256(text).hexdigest(), llvm.llvm_version_info, cpu
+    text = hashlib.sha256()
+    for path, source in _files(resources.files("filterlab")):
+        text.update(f"{path}\0".encode() + hashlib.sha256(source.read_bytes()).digest())
+    cpu = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten(), llvm.get_process_triple()
+    return text.hexdigest(), llvm.llvm_version_info, cpu
+
+
+def _files(package: Traversable) -> Iterator[tuple[str, Traversable]]:
+    """The files of `SOURCES`, in order, each with its path in the package."""
+    left = [(name, package / name) for name in reversed(SOURCES)]
+    while left:
+        path, found = left.pop()
+        if found.is_file():
+            yield path, found
+        elif found.name != "__pycache__":
+            left += sorted(((f"{path}/{f.name}", f) for f in found.iterdir()), reverse=True)
 
 
 def _machine() -> llvm.TargetMachine:
@@ -96,5 +130,22 @@ def _load(code: bytes) -> Function:
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    _engines.append(engine)
-    return ctypes.CFUNCTYPE(None, ctypes.c_void_p)(engine.get_function_address(ENTRY))
+    function = _signature(engine.get_function_address(ENTRY))
+    function.owner = engine  # type: ignore[attr-defined]  # of the machine code: it lives as long as who calls it
+    return function
+
+
+# --- forks and the end ------------------------------------------------------------------------------------------------
+
+
+if hasattr(llvm.ffi.lib, "_lock"):  # llvmlite's own, which others who use it may hold
+    forking.others.append(llvm.ffi.lib._lock)
+
+
+@atexit.register
+def _finish() -> None:
+    """Programs of the C library end LLVM when the process does: not while a thread is in the middle of it."""
+    while True:
+        with contextlib.suppress(BaseException):
+            forking.lock.acquire()
+            return

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 
 from llvmlite import ir
 
-from filterlab.ops.cpu import frame, mathematics
+from filterlab.ops.cpu import frame, job, mathematics
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import DOUBLE, I64, POINTER, STORAGE, Lanes, Value
 from filterlab.ops.cpu.optics import Lights, Located, Steps, TransferTable, optical_depth, shade
@@ -91,8 +91,8 @@ FIELDS: dict[str, type] = {
 _WRITTEN_OUT = 12  # rows times planes, see `Taps`
 
 
-class Job(ctypes.Structure):
-    _fields_ = list(FIELDS.items())
+class Job(job.Job):
+    _fields_ = tuple(FIELDS.items())
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 from llvmlite import ir
 
-from filterlab.ops.cpu import frame
+from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import I1, I64, Lanes, Value
 
@@ -44,8 +44,8 @@ FIELDS: dict[str, type] = {
 }
 
 
-class Job(ctypes.Structure):
-    _fields_ = list(FIELDS.items())
+class Job(job.Job):
+    _fields_ = tuple(FIELDS.items())
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,8 @@
-"""What the programs have in common: a function `run(Job *)` that takes chunks of work until none is left."""
+"""What the programs have in common: `run(Job *, i64 thread, i64 most)`, which takes chunks of work until none is left.
+
+`thread` is a number from 0 on, another one for everybody who works on the same job at the same time; after `most`
+chunks the function returns.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +14,13 @@ from llvmlite import ir
 
 from filterlab.ops.cpu.lanes import DOUBLE, I64, POINTER, Lanes, Value
 
-ENTRY = "run"  # name of the compiled function: void run(Job *)
+ENTRY = "run"  # name of the compiled function
 
 
 def new_module() -> tuple[ir.Module, ir.Function]:
     """A module with the empty function `run`."""
     module = ir.Module("filterlab")
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER]), ENTRY)
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER, I64, I64]), ENTRY)
     function.attributes.add("nounwind")
     return module, function
 
@@ -33,14 +37,20 @@ def load_job(e: Lanes, address: Value, fields: Mapping[str, type]) -> SimpleName
 
 @contextmanager
 def every_chunk(e: Lanes, job: SimpleNamespace) -> Iterator[Value]:
-    """while (c = next++) < chunks: the with-block, given c."""
+    """while most-- > 0 and (c = next++) < chunks: the with-block, given c."""
     b = e.builder
-    take, work, done = (b.append_basic_block(name) for name in ("take", "work", "done"))
-    b.branch(take)
+    most = b.function.args[2]
+    before, test, take, work, done = b.block, *(b.append_basic_block(n) for n in ("test", "take", "work", "done"))
+    b.branch(test)
+    b.position_at_end(test)
+    left = b.phi(I64, "left")
+    left.add_incoming(most, before)
+    b.cbranch(b.icmp_signed(">", left, I64(0)), take, done)
     b.position_at_end(take)
     c = b.atomic_rmw("add", job.next, I64(1), "monotonic")
     b.cbranch(b.icmp_signed("<", c, job.chunks), work, done)
     b.position_at_end(work)
     yield c
-    b.branch(take)
+    left.add_incoming(b.sub(left, I64(1)), b.block)
+    b.branch(test)
     b.position_at_end(done)

@@ -8,7 +8,7 @@ Points that lie all over a large volume are sorted first (`order`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,11 +16,11 @@ from torch import Tensor
 
 from filterlab.ops.cpu import compiler, order
 from filterlab.ops.cpu import threads as pool
-from filterlab.ops.cpu.job import AXES, Job
-from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, lanes_of, threads_for
+from filterlab.ops.cpu.job import AXES, Function
+from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, MOST_POINTS, lanes_of, threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh, zeros
 from filterlab.ops.cpu.order import Sorted
-from filterlab.ops.cpu.points import BLOCK, Recipe
+from filterlab.ops.cpu.points import BLOCK, Job, Recipe
 from filterlab.ops.gather import STORAGE, readable
 from filterlab.ops.stencil import Stencil
 
@@ -156,7 +156,7 @@ class Program:
         lanes: P.
     """
 
-    run: Callable[[int], None]
+    run: Function
     job: Job
     lanes: int
 
@@ -204,38 +204,55 @@ class Program:
             gradient: (N, M, 3), written by pull.
         """
         threads = _threads(points)
-        job, _ = self._described(points, rows, threads * CHUNKS_PER_THREAD if threads > 1 else 1)
-        job.coefficients = coefficients.data_ptr()
+        blocks = self._blocks(points, threads * CHUNKS_PER_THREAD if threads > 1 else 1)
+        job = self._described(points, rows, -(-blocks // self._cuts(blocks)))
+        job.point(coefficients=coefficients)
         if gradient is not None:
-            job.gradient = gradient.data_ptr()
+            job.point(gradient=gradient)
         pool.run(self.run, [job] * threads)
 
     def divide(self, volumes: Sequence[Tensor], points: Tensor, rows: Tensor) -> None:
         """scatter: a thread for each of `volumes` (as of `memory.zeros`), with an equal share of the points."""
-        job, parts = self._described(points, rows, len(volumes))
-        pool.run(self.run, [_own_share(job, i, volume) for i, volume in enumerate(volumes[:parts])])
+        blocks = self._blocks(points, len(volumes))
+        cuts = _least_divisor(blocks, self._cuts(blocks))  # shares end where they would without
+        job = self._described(points, rows, blocks // cuts)
+        firsts = range(0, job.chunks // job.entries, cuts)
+        shares = [_own_share(job, first, cuts, volume) for first, volume in zip(firsts, volumes, strict=False)]
+        pool.run(self.run, shares)
 
-    def _described(self, points: Tensor, rows: Tensor, parts: int) -> tuple[Job, int]:
-        """The job of these points, cut into so many parts or a little fewer; and how many."""
+    def _blocks(self, points: Tensor, parts: int) -> int:
+        """Blocks of packs in one of so many parts of an entry's points, or of a little fewer."""
+        packs = -(-points.shape[1] // self.lanes)
+        return -(-packs // (parts * BLOCK))
+
+    def _cuts(self, blocks: int) -> int:
+        """Into how many chunks so many blocks are cut at least."""
+        most = max(1, MOST_POINTS // (self.lanes * BLOCK * self.job.channels))
+        return -(-blocks // most)
+
+    def _described(self, points: Tensor, rows: Tensor, blocks: int) -> Job:
+        """The job of these points in chunks of so many blocks."""
         entries, count = points.shape[:2]
-        job = Job.from_buffer_copy(self.job)
-        packs = -(-count // self.lanes)
-        blocks = -(-packs // BLOCK)
-        chunk = -(-blocks // parts) * BLOCK
-        parts = -(-packs // chunk)
-        job.points, job.rows = points.data_ptr(), rows.data_ptr()
+        job = self.job.copy()
+        job.point(points=points, rows=rows)
         assert all((job.points, job.rows)), "tensors without memory"
+        chunk = blocks * BLOCK
         job.count, job.entries, job.points_entry = count, entries, points.stride(0)
-        job.chunk, job.chunks = chunk, parts * entries
-        return job, parts
+        job.chunk, job.chunks = chunk, -(-count // (self.lanes * chunk)) * entries
+        return job
 
 
-def _own_share(job: Job, part: int, volume: Tensor) -> Job:
-    """The job of adding one part of every batch entry's points to a volume of its own."""
-    own = Job.from_buffer_copy(job)
-    own.coefficients = volume.data_ptr()
-    own.next, own.chunks = part * job.entries, (part + 1) * job.entries
+def _own_share(job: Job, first: int, parts: int, volume: Tensor) -> Job:
+    """The job of adding some parts of every batch entry's points to a volume of its own."""
+    own = job.copy()
+    own.point(coefficients=volume)
+    own.next, own.chunks = first * job.entries, min((first + parts) * job.entries, job.chunks)
     return own
+
+
+def _least_divisor(number: int, least: int) -> int:
+    """The least divisor of a number from `least` on."""
+    return next(cuts for cuts in range(least, number + 1) if number % cuts == 0)
 
 
 def _threads(points: Tensor) -> int:

@@ -1,33 +1,46 @@
-"""What a compiled kernel is told: one struct of 64-bit fields, described once for Python and for the program."""
+"""What a compiled program is told: one struct of 64-bit fields, described once for Python and for the program.
+
+A job holds the arrays whose addresses it has. Whoever works on it, on whatever thread, holds the job: so no memory goes
+before the last one is done with it, whatever is raised meanwhile.
+"""
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
+from typing import Self
+
+import numpy as np
+from torch import Tensor
 
 AXES = ("x", "y", "z")
 
-# name: ctypes type. Strides are in elements, every field has eight bytes, so both sides agree on the layout.
-FIELDS: dict[str, type] = {
-    "next": ctypes.c_int64,  # the chunk to be taken next; threads add 1 atomically
-    "coefficients": ctypes.c_void_p,  # (N, C, D, H, W); read by gather, added to by scatter
-    "points": ctypes.c_void_p,  # (N, M, 3)
-    "rows": ctypes.c_void_p,  # (N, C, J, M); written by gather, read by scatter and pull
-    "gradient": ctypes.c_void_p,  # (N, M, 3); written by pull
-    "channels": ctypes.c_int64,  # C
-    "count": ctypes.c_int64,  # M, points of one batch entry
-    "width": ctypes.c_int64,  # W
-    "height": ctypes.c_int64,  # H
-    "start": ctypes.c_int64,  # coordinate of coefficient 0
-    **{f"low_{a}": ctypes.c_double for a in AXES},  # smallest and largest coordinate of a first tap
-    **{f"high_{a}": ctypes.c_double for a in AXES},
-    "coefficients_entry": ctypes.c_int64,  # strides: from one batch entry to the next,
-    "coefficients_channel": ctypes.c_int64,  # from one channel to the next,
-    "points_entry": ctypes.c_int64,
-    "chunk": ctypes.c_int64,  # packs of a chunk
-    "entries": ctypes.c_int64,  # N; chunk c is part c // N of batch entry c % N
-    "chunks": ctypes.c_int64,  # `next` stops here
-}
+Function = Callable[[int, int, int], None]
+"""A program: takes the address of a job, the number of the thread among those that share the job, and how many chunks
+to do at most; lets other Python threads run meanwhile."""
 
 
 class Job(ctypes.Structure):
-    _fields_ = list(FIELDS.items())
+    """The part that all have; each kind has fields of its own, of eight bytes each, so both sides agree on the layout.
+
+    Attributes:
+        next: the chunk to be taken next; threads add 1 atomically.
+        chunks: `next` stops here.
+        memory: the arrays that it points to.
+    """
+
+    next: int
+    chunks: int
+    memory: tuple[Tensor | np.ndarray, ...] = ()
+
+    def point(self, **arrays: Tensor | np.ndarray) -> None:
+        """Write where arrays are into the fields of their names, and hold them."""
+        for name, array in arrays.items():
+            setattr(self, name, array.data_ptr() if isinstance(array, Tensor) else array.ctypes.data)
+        self.memory += tuple(arrays.values())
+
+    def copy(self) -> Self:
+        """Another job of the same arrays."""
+        other = type(self).from_buffer_copy(self)
+        other.memory = self.memory
+        return other

@@ -11,6 +11,9 @@ from filterlab.ops.cpu.compiler import features
 CHUNKS_PER_THREAD = 16
 """So that a thread that is held up leaves its share to the others."""
 
+MOST_POINTS = 1 << 16
+"""Of a chunk, times channels: between two of them Ctrl-C is heard."""
+
 
 @cache
 def lanes_of(dtype: torch.dtype) -> int:

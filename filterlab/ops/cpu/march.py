@@ -84,9 +84,7 @@ class _Run:
         self.job = _job(given)
         if (steps := given.transfer.steps) is not None and steps.buckets is not None:
             inputs["buckets"] = steps.buckets
-        self.kept = {name: tensor.detach().resolve_neg().contiguous() for name, tensor in inputs.items()}
-        for name, tensor in self.kept.items():  # what the job points to
-            setattr(self.job, name, tensor.data_ptr())
+        self.job.point(**{name: tensor.detach().resolve_neg().contiguous() for name, tensor in inputs.items()})
 
     def all_rays(self, report: Report) -> None:
         """Let the threads loose on one portion of the rays after the other."""
@@ -100,10 +98,11 @@ class _Run:
 
     def own_rays(self, tables: Tensor, volumes: list[Tensor], report: Report) -> None:
         """The same with a job for each of `tables`: thread i takes blocks i, i + threads, … of the rays."""
-        jobs = [Job.from_buffer_copy(self.job) for _ in tables]
+        jobs = [self.job.copy() for _ in tables]
         for i, job in enumerate(jobs):
-            job.table_gradient = tables[i].data_ptr()
-            job.coefficient_gradient = volumes[i].data_ptr() if volumes else None
+            job.point(table_gradient=tables[i])
+            if volumes:
+                job.point(coefficient_gradient=volumes[i])
         for first in range(0, self.rays, RAYS_AT_ONCE):
             for i, job in enumerate(jobs):
                 job.first, job.last = first, min(first + RAYS_AT_ONCE, self.rays)

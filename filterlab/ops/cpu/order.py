@@ -25,13 +25,12 @@ Memory: copies of the points and rows of `POINTS_AT_ONCE` points, 4 bytes more f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.ops.cpu import compiler, sorting
+from filterlab.ops.cpu import compiler, threads
 from filterlab.ops.cpu.sorting import AXES, Job, Recipe
 
 POINTS_AT_ONCE = 1 << 22  # points that are sorted together, for which copies of points and rows are held
@@ -72,7 +71,8 @@ class Sorted:
         self._begin = np.zeros(math.prod(bricks), np.int32)
         self._rank = np.empty(self.count, np.int32)
         moved = np.empty((self.count, 3), self.arithmetic)
-        job = self._job(points=points.data_ptr(), sorted=moved.ctypes.data, start=start, per_edge=1 / edge)
+        job = self._job(start=start, per_edge=1 / edge)
+        job.point(points=points, sorted=moved)
         for axis, number, step in zip(AXES, bricks, (1, bricks[0], bricks[0] * bricks[1]), strict=True):
             setattr(job, f"last_{axis}", number - 1)
             setattr(job, f"step_{axis}", step)
@@ -90,15 +90,15 @@ class Sorted:
         self._exchange("arrange", sorted_rows, rows)
 
     def _exchange(self, step: str, sorted_rows: Tensor, rows: Tensor) -> None:
-        job = self._job(
-            rows=rows.data_ptr(), sorted_rows=sorted_rows.data_ptr(), stride=rows.stride(0), row_count=rows.shape[0]
-        )
+        job = self._job(stride=rows.stride(0), row_count=rows.shape[0])
+        job.point(rows=rows, sorted_rows=sorted_rows)
         self._run(step, job)
 
     def _job(self, **fields) -> Job:
-        return Job(brick=self._rank.ctypes.data, begin=self._begin.ctypes.data, count=self.count, chunks=1, **fields)
+        job = Job(count=self.count, chunks=1, **fields)
+        job.point(brick=self._rank, begin=self._begin)
+        return job
 
     def _run(self, step: str, job: Job) -> None:
         job.next = 0
-        run: Callable[[int], None] = compiler.compiled(Recipe(step, self.arithmetic, self.lanes))
-        run(sorting.ctypes.addressof(job))
+        threads.run(compiler.compiled(Recipe(step, self.arithmetic, self.lanes)), [job])

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Callable
-
+import numpy as np
 import torch
 from torch import Tensor
 
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.folding import LOST, TURNED, Job, Recipe
-from filterlab.ops.cpu.job import AXES
-from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, lanes_of, threads_for
+from filterlab.ops.cpu.job import AXES, Function
+from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, MOST_POINTS, lanes_of, threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh
 from filterlab.ops.gather import readable
 from filterlab.ops.place import Placed, Placement
@@ -37,7 +35,7 @@ class Placing:
         self.job = _job(placement)
         self.run = self._program(signs=False)
 
-    def _program(self, signs: bool) -> Callable[[int], None]:
+    def _program(self, signs: bool) -> Function:
         geometry, boundary = self.placement.geometry, self.placement.boundary
         x, y, z = (_how_it_folds(boundary, n) for n in self.placement.size)
         affine = "identity" if geometry.is_identity else "full" if geometry.diagonal is None else "diagonal"
@@ -52,17 +50,18 @@ class Placing:
         count = points.numel() // 3
         threads = threads_for(count, _POINTS_PER_THREAD)
         packs = -(-count // self.lanes)
-        chunk = -(-packs // (threads * CHUNKS_PER_THREAD if threads > 1 else 1))
+        chunk = min(-(-packs // (threads * CHUNKS_PER_THREAD if threads > 1 else 1)), MOST_POINTS // self.lanes)
         chunks = -(-packs // chunk)
-        met = (ctypes.c_int64 * chunks)()
-        job = Job.from_buffer_copy(self.job)
-        job.points, job.located, job.met = points.data_ptr(), located.data_ptr(), ctypes.addressof(met)
+        met = np.zeros(chunks, np.int64)
+        job = self.job.copy()
+        job.point(points=points, located=located, met=met)
         job.count, job.chunk, job.chunks = count, chunk, chunks
         pool.run(self.run, [job] * threads)
-        found, sign = set(met), None
+        found, sign = set(met.tolist()), None
         if found & _TURNED:
             sign = fresh(points.shape, self.dtype)
-            job.signs, job.next = sign.data_ptr(), 0
+            job.point(signs=sign)
+            job.next = 0
             pool.run(self._program(signs=True), [job] * threads)
         return self._with_lost(points, located, sign) if found & _LOST else (located, sign)
 

@@ -8,17 +8,44 @@ a copy of the remaining points, followed by zeros.
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 
 from llvmlite import ir
 
-from filterlab.ops.cpu import frame
-from filterlab.ops.cpu.job import FIELDS
+from filterlab.ops.cpu import frame, job
+from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import I1, I64, POINTER, STORAGE, Lanes, Value, Variable
 from filterlab.ops.cpu.taps import Grid, Location, Taps
 from filterlab.ops.stencil import Lowered
 
 BLOCK = 16  # packs that are located before the first of them is summed
+
+# Strides are in elements.
+FIELDS: dict[str, type] = {
+    "next": ctypes.c_int64,  # the chunk to be taken next; threads add 1 atomically
+    "coefficients": ctypes.c_void_p,  # (N, C, D, H, W); read by gather, added to by scatter
+    "points": ctypes.c_void_p,  # (N, M, 3)
+    "rows": ctypes.c_void_p,  # (N, C, J, M); written by gather, read by scatter and pull
+    "gradient": ctypes.c_void_p,  # (N, M, 3); written by pull
+    "channels": ctypes.c_int64,  # C
+    "count": ctypes.c_int64,  # M, points of one batch entry
+    "width": ctypes.c_int64,  # W
+    "height": ctypes.c_int64,  # H
+    "start": ctypes.c_int64,  # coordinate of coefficient 0
+    **{f"low_{a}": ctypes.c_double for a in AXES},  # smallest and largest coordinate of a first tap
+    **{f"high_{a}": ctypes.c_double for a in AXES},
+    "coefficients_entry": ctypes.c_int64,  # strides: from one batch entry to the next,
+    "coefficients_channel": ctypes.c_int64,  # from one channel to the next,
+    "points_entry": ctypes.c_int64,
+    "chunk": ctypes.c_int64,  # packs of a chunk
+    "entries": ctypes.c_int64,  # N; chunk c is part c // N of batch entry c % N
+    "chunks": ctypes.c_int64,  # `next` stops here
+}
+
+
+class Job(job.Job):
+    _fields_ = tuple(FIELDS.items())
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ _STATES = (
     8  # packs that a bundle's recursions remember, K times the poles; with AVX2 2 are slower by a quarter, so are 16
 )
 _NUMBERS_PER_THREAD = 1 << 16  # fewer are not worth waking a thread for
+_MOST_NUMBERS = 1 << 22  # of a chunk, unless a plane has more: between two of them Ctrl-C is heard
 _ALIGNMENT = 64  # bytes of a cache line
 
 
@@ -81,10 +82,10 @@ class _Filter:
             planes=d,
             lines=h,
             width=w,
-            places=places_x.data_ptr(),
+            places=places_x,
             count=out_w,
             along_y=1,
-            places_y=places_y.data_ptr(),
+            places_y=places_y,
             count_y=out_h,
             before_y=self.tail,
             gain=self.gain**3,
@@ -115,7 +116,7 @@ class _Filter:
                 planes=1,
                 lines=outer,
                 width=n,
-                places=places.data_ptr(),
+                places=places,
                 count=count,
                 gain=self.gain,
                 part=part,
@@ -140,7 +141,7 @@ class _Filter:
             source_row=source.stride(1),
             target_row=target.stride(1),
             width=width,
-            places=places.data_ptr(),
+            places=places,
             count=count,
             gain=gain,
             part=part,
@@ -148,7 +149,15 @@ class _Filter:
             chunks=entries * parts,
         )
 
-    def _run(self, columns: bool, source: Tensor, target: Tensor, **fields: float) -> None:
+    def _run(
+        self,
+        columns: bool,
+        source: Tensor,
+        target: Tensor,
+        places: Tensor,
+        places_y: Tensor | None = None,
+        **fields: float,
+    ) -> None:
         """Compile, add what all jobs need, and let the threads loose."""
         storage, arithmetic = STORAGE[source.dtype], ARITHMETIC[self.dtype]
         recipe = Recipe(columns, len(self.poles), arithmetic, storage, self.lanes, self.packs)
@@ -158,20 +167,18 @@ class _Filter:
         rows = _rounded(int(max(fields["width"], fields["count"])), self.lanes) if not columns else 0
         size = transposed + _rounded(rows * self.bundle, _ALIGNMENT)
         threads = self._threads(target.numel())
-        # the program is entered by every thread, and again by the one that waits for the others, when nothing is left
         scratch = _scratch(threads * size * self.dtype.itemsize)
         job = Job(
-            source=source.data_ptr(),
-            target=target.data_ptr(),
-            scratch=scratch.ctypes.data,
             scratch_size=size,
             transposed=transposed,
             source_entry=source.stride(0),
             target_entry=target.stride(0),
             warm_up=self.warm_up,
-            poles=self.poles.ctypes.data,
             **fields,
         )
+        job.point(source=source, target=target, scratch=scratch, poles=self.poles, places=places)
+        if places_y is not None:
+            job.point(places_y=places_y)
         pool.run(function, [job] * threads)
 
     def _fresh(self, shape: tuple[int, ...]) -> Tensor:
@@ -189,7 +196,8 @@ class _Filter:
 
     def _part(self, lines: int, entries: int = 1) -> int:
         """Neighbouring lines of a chunk: whole bundles, few enough that all threads have enough to take."""
-        chunks = max(1, self._threads(self.samples.numel()) * CHUNKS_PER_THREAD // entries)
+        numbers = self.samples.numel()
+        chunks = max(1, self._threads(numbers) * CHUNKS_PER_THREAD // entries, numbers // (_MOST_NUMBERS * entries))
         return _rounded(max(1, lines // chunks), self.bundle)
 
 

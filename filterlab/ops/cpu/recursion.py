@@ -29,16 +29,15 @@ from dataclasses import dataclass
 
 from llvmlite import ir
 
-from filterlab.ops.cpu import frame
+from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.lanes import DOUBLE, I64, POINTER, STORAGE, Lanes, Storage, Value, Variable
 
 # Strides count elements. A chunk is `part` lines of one plane, or `part` neighbouring columns of one entry.
 FIELDS: dict[str, type] = {
     "next": ctypes.c_int64,  # the chunk to be taken next; threads add 1 atomically
-    "entered": ctypes.c_int64,  # how often the program was entered: each time gets a scratch array of its own
     "source": ctypes.c_void_p,  # (entries, planes, lines, width) along x; (entries, length, width) for columns
     "target": ctypes.c_void_p,  # the same with `count` places instead of the length of the axis; the place of sample 0
-    "scratch": ctypes.c_void_p,
+    "scratch": ctypes.c_void_p,  # an array for every thread
     "scratch_size": ctypes.c_int64,  # of one scratch array: first the rows of a, then, from
     "transposed": ctypes.c_int64,  # this element on, a bundle of lines along x as rows
     "source_entry": ctypes.c_int64,  # strides
@@ -65,8 +64,8 @@ FIELDS: dict[str, type] = {
 }
 
 
-class Job(ctypes.Structure):
-    _fields_ = list(FIELDS.items())
+class Job(job.Job):
+    _fields_ = tuple(FIELDS.items())
 
 
 @dataclass(frozen=True)
@@ -135,8 +134,8 @@ class _Program:
         self.storage, self.number = STORAGE[recipe.storage], STORAGE[recipe.arithmetic]
 
     def write(self) -> None:
-        e, b, job = self.lanes, self.builder, self.function.args[0]
-        self.job = j = frame.load_job(e, job, FIELDS)
+        e, b = self.lanes, self.builder
+        self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         self.gain = e.everywhere(e.scalar(j.gain))
         where = [e.advance(j.poles, I64(i), DOUBLE) for i in range(self.recipe.poles)]
         self.poles = [e.everywhere(e.scalar(b.load(address, typ=DOUBLE))) for address in where]
@@ -145,8 +144,7 @@ class _Program:
         for first in range(0, self.bundle, e.count):
             e.store(e.constant(0), e.advance(self.zeros, I64(first), e.number))
         self.sources, self.targets = (e.reserve(I64, self.bundle) for _ in range(2))
-        entered = e.advance(job, I64(list(FIELDS).index("entered")), I64)
-        own = b.mul(b.atomic_rmw("add", entered, I64(1), "monotonic"), j.scratch_size)
+        own = b.mul(self.function.args[1], j.scratch_size)
         self.scratch = e.advance(j.scratch, own, e.number)
         self.transposed = e.advance(self.scratch, j.transposed, e.number)
         with frame.every_chunk(e, j) as chunk:

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 
 from llvmlite import ir
 
-from filterlab.ops.cpu import frame
+from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import I32, I64, Lanes, Value
 
@@ -41,8 +41,8 @@ FIELDS: dict[str, type] = {
 }
 
 
-class Job(ctypes.Structure):
-    _fields_ = list(FIELDS.items())
+class Job(job.Job):
+    _fields_ = tuple(FIELDS.items())
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ class Recipe:
         module, function = frame.new_module()
         builder = ir.IRBuilder(function.append_basic_block("entry"))
         e = Lanes(builder, self.arithmetic, self.lanes)
-        job = frame.load_job(e, function.args[0], FIELDS)
-        with frame.every_chunk(e, job):
-            {"count": _count, "move": _move, "restore": _restore, "arrange": _arrange}[self.step](e, job)
+        told = frame.load_job(e, function.args[0], FIELDS)
+        with frame.every_chunk(e, told):
+            {"count": _count, "move": _move, "restore": _restore, "arrange": _arrange}[self.step](e, told)
         builder.ret_void()
         return str(module)
 

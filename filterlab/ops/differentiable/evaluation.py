@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from filterlab import forking
 from filterlab.ops.differentiable import operators
 from filterlab.ops.differentiable.gather import gather
 from filterlab.ops.differentiable.place import place
@@ -51,7 +52,8 @@ class Evaluation:
     def _of(self, points: Tensor) -> Prepared:
         found = self._prepared.get(points.dtype)
         if found is None:
-            from filterlab.ops.cpu.evaluation import Evaluator  # it needs llvmlite
+            with forking.lock:
+                from filterlab.ops.cpu.evaluation import Evaluator  # it needs llvmlite
 
             parts = (self.coefficients, self.placement, self.stencil, self.start)
             found = self._prepared[points.dtype] = Evaluator(*parts, points)

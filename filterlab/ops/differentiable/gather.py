@@ -19,6 +19,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from filterlab import forking
 from filterlab.ops import cpu, cuda
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.gather import MAX_ORDER
@@ -62,13 +63,15 @@ class Implementation:
 
 
 def _on_the_cpu() -> Any:
-    from filterlab.ops.cpu import gather  # it needs llvmlite
+    with forking.lock:
+        from filterlab.ops.cpu import gather  # it needs llvmlite
 
     return gather
 
 
 def _on_a_gpu() -> Any:
-    from filterlab.ops.cuda import gather  # it needs Triton
+    with forking.lock:
+        from filterlab.ops.cuda import gather  # it needs Triton
 
     return gather
 

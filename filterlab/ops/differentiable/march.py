@@ -18,9 +18,10 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
+from filterlab import forking
 from filterlab.ops import cpu, cuda
 from filterlab.ops.differentiable.gather import gather
-from filterlab.ops.differentiable.recording import transforming
+from filterlab.ops.differentiable.recording import differentiating, transforming
 from filterlab.ops.march import MAX_LIGHTS, Bricks, March
 from filterlab.ops.march_derivatives import GRADIENTS, MEMBERS
 from filterlab.ops.reference import march as reference
@@ -39,13 +40,14 @@ def implementation_for(coefficients: Tensor) -> str:
 
 
 def _loaded(implementation: str) -> ModuleType:
-    if implementation == "cuda":
-        from filterlab.ops.cuda import march as on_a_gpu  # it needs Triton
+    with forking.lock:
+        if implementation == "cuda":
+            from filterlab.ops.cuda import march as on_a_gpu  # it needs Triton
 
-        return on_a_gpu
-    from filterlab.ops.cpu import march as on_the_cpu  # it needs llvmlite
+            return on_a_gpu
+        from filterlab.ops.cpu import march as on_the_cpu  # it needs llvmlite
 
-    return on_the_cpu
+        return on_the_cpu
 
 
 def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dtype, lights: int) -> str | None:
@@ -67,13 +69,13 @@ def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dty
     return room.missing(coefficients.detach()[None, None], points, stencil, None, start)
 
 
-@torch.no_grad()
+@differentiating(False)
 def run(given: March, report: Report = lambda rays: None, implementation: str | None = None) -> tuple[Tensor, Tensor]:
     """Light (R, 3) and optical depth (R,), float64, without derivatives; by default on the device of the tensors."""
     return _loaded(implementation or implementation_for(given.coefficients)).march(given, report)
 
 
-@torch.no_grad()
+@differentiating(False)
 def adjoint(
     given: March,
     light: Tensor,
@@ -159,7 +161,7 @@ def _by_the_adjoint(
     asked: _Asked, tensors: Sequence[Tensor], needed: Sequence[bool], light: Tensor, cotangents: Sequence[Tensor]
 ) -> list[Tensor | None]:
     """By the fused adjoint, and from what was prepared for it back to the tensors by autograd."""
-    with torch.enable_grad():
+    with differentiating(True):
         leaves = [t.detach().requires_grad_(need) for t, need in zip(tensors, needed, strict=True)]
         given = asked.prepared(leaves)
     named = given.tensors

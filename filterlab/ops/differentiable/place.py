@@ -7,13 +7,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from filterlab import forking
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.place import Placed, Placement
 from filterlab.ops.reference import place as reference
 
 
 def _on_the_cpu(points: Tensor, placement: Placement) -> Placed:
-    from filterlab.ops.cpu import place  # it needs llvmlite
+    with forking.lock:
+        from filterlab.ops.cpu import place  # it needs llvmlite
 
     return place.place(points, placement)
 

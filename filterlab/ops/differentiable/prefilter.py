@@ -18,6 +18,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from filterlab import forking
 from filterlab.ops import cpu
 from filterlab.ops.differentiable.recording import plain
 from filterlab.ops.gather import STORAGE
@@ -159,7 +160,8 @@ def _fused(samples: Tensor, how: Filtering) -> Tensor:
 
 
 def _compute(samples: Tensor, how: Filtering) -> Tensor:
-    from filterlab.ops.cpu import prefilter as fused  # it needs llvmlite
+    with forking.lock:
+        from filterlab.ops.cpu import prefilter as fused  # it needs llvmlite
 
     return fused.filter_axes(samples, how)
 
