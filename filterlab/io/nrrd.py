@@ -64,6 +64,11 @@ _PLAIN = ("scanner-xyz", "3d-right-handed", "3d-left-handed")
 _ALIASES = {"datafile": "data file", "byteskip": "byte skip", "lineskip": "line skip", "axismins": "axis mins"}
 _ALIASES |= {"axismaxs": "axis maxs", "centers": "centerings", "blocksize": "block size"}
 
+MAX_FIELDS = 1000
+MAX_VALUE = 4096  # characters of a value that is taken apart; 16 vectors take a third of it
+_TAKEN_APART = ("type", "dimension", "sizes", "encoding", "endian", "data file", "byte skip", "line skip", "centerings")
+_TAKEN_APART += ("space", "space dimension", "space directions", "space origin", "spacings", "axis mins", "axis maxs")
+
 
 def read_header(path: Path) -> VolumeHeader:
     """The checked header of an NRRD file. Raises VolumeFileError."""
@@ -113,6 +118,10 @@ def _fields(path: Path, file: BinaryIO) -> dict[str, str]:
         name = _ALIASES.get(name.lower(), name.lower())
         if not colon or name in fields:
             raise VolumeFileError(path, "every header line to be `field: value`, once", repr(text[:80]))
+        if len(fields) == MAX_FIELDS:
+            raise VolumeFileError(path, f"at most {MAX_FIELDS} fields in the header", "more")
+        if name in _TAKEN_APART and len(value) > MAX_VALUE:
+            raise VolumeFileError(path, f"at most {MAX_VALUE} characters in `{name}`", len(value))
         fields[name] = value.strip()
     if "data file" not in fields:
         raise VolumeFileError(path, "an empty line after the header, then samples", "the end of the file")
