@@ -50,6 +50,7 @@ Row = tuple[float, float, float, float]
 _GEOMETRY = ("affine", "spacing", "origin")
 _SUFFIX = ".npy"
 MAX_NPY_HEADER = 2**16
+MAX_NPY_TEXT = 1024  # of it, padding aside, which NumPy evaluates as Python: 0.2 s and more for ten times that
 MAX_DIRECTORY = 2**18  # bytes; of an entry, 46 and more, zipfile makes an object of 700
 
 
@@ -72,9 +73,12 @@ def _array_header(path: Path, stream: BinaryIO) -> tuple[tuple[int, ...], bool, 
         raise VolumeFileError(path, "a valid npy header, version 1.0 or 2.0", f"{start!r}")
     length = stream.read(2 * version[0])
     count = int.from_bytes(length, "little")
-    if count > MAX_NPY_HEADER:
+    if len(length) != 2 * version[0] or count > MAX_NPY_HEADER:
         raise VolumeFileError(path, f"a valid npy header of at most {MAX_NPY_HEADER} bytes", count)
-    header = io.BytesIO(length + stream.read(count))
+    text = stream.read(count).strip()
+    if len(text) > MAX_NPY_TEXT:
+        raise VolumeFileError(path, f"a valid npy header of at most {MAX_NPY_TEXT} characters", len(text))
+    header = io.BytesIO((len(text) + 1).to_bytes(len(length), "little") + text + b"\n")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     try:
         with warnings.catch_warnings():

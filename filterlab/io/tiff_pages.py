@@ -29,6 +29,7 @@ MAX_TAGS = 2**12
 MAX_TEXT = 10_000
 MAX_SEGMENT = 2**26
 SHARING = 4  # how often what pages claim may be read anew, because they share strips or pad their tiles
+OVERHEAD = 16  # bytes of deflate data that hold nothing
 
 WIDTH, LENGTH, BITS, COMPRESSION, FILL_ORDER, DESCRIPTION = 256, 257, 258, 259, 266, 270
 STRIP_OFFSETS, SAMPLES_PER_PIXEL, ROWS_PER_STRIP, STRIP_COUNTS = 273, 277, 278, 279
@@ -297,7 +298,7 @@ class TiffFile:
             raise VolumeFileError(path, "a TIFF file (II or MM, then 42 or 43)", "something else")
         self._counter, self._entry, self._offset = ("Q", "HHQQ", "Q") if version == 43 else ("H", "HHII", "I")
         self._first = struct.unpack_from(self.order + self._offset, start, 8 if version == 43 else 4)[0]
-        self._spent = self._read = self._stored = self._claimed = 0
+        self._spent = self._read = self._stored = self._claimed = self._segments = 0
 
     def __iter__(self) -> Iterator[Directory]:
         offset, seen = self._first, set()
@@ -358,8 +359,9 @@ class TiffFile:
         self._claimed += plane.nbytes
         self._read += held
         self._stored += stored
+        self._segments += len(counts)
         if self._read > EXPANSION["deflate"] * self.length + SHARING * self._claimed or (
-            self._stored > self.length + SHARING * self._claimed
+            self._stored > self.length + 2 * self._read + OVERHEAD * self._segments
         ):
             expected = f"pages of {self._claimed} bytes from its {self.length} bytes"
             raise VolumeFileError(self.path, expected, f"strips or tiles of {self._read}, {self._stored} in the file")
