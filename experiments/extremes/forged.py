@@ -270,7 +270,7 @@ def nifti(pen: Pen, version: int, encoding: str) -> Forged:
         struct.pack_into(order + layout, head, at, *values[name])
     magic = pen.field("magic", b"n+1\0" if version == 1 else b"n+2\0\r\n\x1a\n", b"ni1\0", b"n+3\0", b"????")
     struct.pack_into(f"{len(magic)}s", head, 344 if version == 1 else 4, magic)
-    body = samples.astype(samples.dtype.newbyteorder(order)).tobytes() * (frames or 1)
+    body = samples.astype(order + samples.dtype.str[1:]).tobytes() * (frames or 1)
     content = bytes(head) + (b"\1\0\0\0" if extension else bytes(4)) + extension + body
     name = "a.nii.gz" if encoding == "gzip" else "a.nii"
     return pen.forged({name: packed(pen, content, encoding)}, name, _scaled(samples, *slope), frame)

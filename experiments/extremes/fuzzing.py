@@ -34,11 +34,8 @@ from filterlab.io.volumes import files_of
 
 MAX_BYTES = 2**20  # what a volume may take here, as `load_volume` is told
 BASE_PEAK, PEAK_OF_FILE, PEAK_OF_SAMPLES = 4 * 2**20, 2, 3  # memory: that, and so many times the file and max_bytes
-BASE_SECONDS, SECONDS_OF_FILE, SECONDS_OF_SAMPLES = (
-    1.0,
-    2e-6,
-    5e-8,
-)  # CPU time: that, and so much for every byte of both
+# CPU time: that, and so much for every byte of both
+BASE_SECONDS, SECONDS_OF_FILE, SECONDS_OF_SAMPLES = 1.0, 4e-6, 5e-8
 ADDRESS_SPACE = 2**28  # more than the process has when it begins; past it, allocating fails
 SECONDS = 20.0  # a case that takes longer hangs
 _SILENCE = 120.0  # a process that tells of nothing for so long hangs where no alarm reaches it

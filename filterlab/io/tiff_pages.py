@@ -17,12 +17,13 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
-from filterlab.io.bounded import BLOCK, EXPANSION, VolumeFileError, check_size, sample_dtype
+from filterlab.io.bounded import BLOCK, EXPANSION, SAMPLE_TYPES, VolumeFileError, check_size, sample_dtype
 
 MAX_PAGES = 2**20
 MAX_TAGS = 2**12
@@ -173,6 +174,20 @@ def _unpredicted(content: bytes | bytearray, shape: tuple[int, int], dtype: np.d
     return np.cumsum(words, axis=1, dtype=words.dtype, out=words).view(dtype.newbyteorder("="))
 
 
+@lru_cache
+def _dtype(order: str, kind: str, itemsize: int) -> np.dtype:
+    """The type of samples; nothing that anyone can add up, where NumPy has none."""
+    try:
+        return np.dtype(f"{order}{kind}{itemsize}")
+    except TypeError:
+        return np.dtype(f"V{itemsize}")
+
+
+@lru_cache
+def _known(dtype: np.dtype) -> bool:
+    return dtype.name in SAMPLE_TYPES
+
+
 def _exactly(file: BinaryIO, at: int, count: int) -> bytes:
     file.seek(at)
     return file.read(count)
@@ -184,7 +199,15 @@ class Directory:
 
     file: TiffFile
     tags: dict[int, tuple[int, int, int]]
+    start: int
+    entries: bytes
     last: bool
+
+    def _bytes(self, at: int, count: int) -> bytes:
+        """Bytes of the file; most values stand in the entries themselves, which have been read."""
+        if self.start <= at and at + count <= self.start + len(self.entries):
+            return self.entries[at - self.start : at - self.start + count]
+        return _exactly(self.file.stream, at, count)
 
     def numbers(self, tag: int, count: int) -> np.ndarray:
         """So many whole numbers, at once. Raises VolumeFileError."""
@@ -195,15 +218,18 @@ class Directory:
         dtype = np.dtype(self.file.order + _WHOLE[kind])
         if at + n * dtype.itemsize > length:
             raise VolumeFileError(path, f"tag {tag} within its {length} bytes", f"{n} values at {at}")
-        if n > 1:
+        if n * dtype.itemsize > 8:
             self.file.spend(n * dtype.itemsize)
-        return np.frombuffer(_exactly(self.file.stream, at, n * dtype.itemsize), dtype)
+        return np.frombuffer(self._bytes(at, n * dtype.itemsize), dtype)
 
     def number(self, tag: int, default: int | None = None) -> int:
         """One whole number. Raises VolumeFileError if there are more, or none and no default."""
         if tag not in self.tags and default is not None:
             return default
-        return int(self.numbers(tag, 1)[0])
+        kind, n, at = self.tags.get(tag, (0, 0, 0))
+        if n != 1 or kind not in _WHOLE or at < self.start:
+            return int(self.numbers(tag, 1)[0])
+        return int.from_bytes(self._bytes(at, _TYPE_BYTES[kind]), "little" if self.file.order == "<" else "big")
 
     def ratio(self, tag: int) -> float | None:
         """A positive ratio; None where there is none."""
@@ -248,12 +274,9 @@ class Directory:
         bits = self.number(BITS, 1)
         if bits not in (8, 16, 32, 64, 128) or self.number(FILL_ORDER, 1) != 1:
             raise VolumeFileError(path, "whole bytes per pixel, in order", f"{bits} bits")
-        kind = _KINDS.get(self.number(SAMPLE_FORMAT, 1), "")
-        try:
-            dtype = np.dtype(f"{self.file.order}{kind}{bits // 8}" if kind else "V1")
-        except TypeError:
-            dtype = np.dtype(f"V{bits // 8}")
-        sample_dtype(path, dtype)
+        dtype = _dtype(self.file.order, _KINDS.get(self.number(SAMPLE_FORMAT, 1), "V"), bits // 8)
+        if not _known(dtype):
+            sample_dtype(path, dtype)
         code = self.number(COMPRESSION, 1)
         encoding = _COMPRESSIONS.get(code)
         if encoding is None:
@@ -319,15 +342,15 @@ class TiffFile:
                 self.path, f"at most {MAX_TAGS} tags within its {self.length} bytes", f"{count} of them"
             )
         self.spend(head + count * size)
-        entries = struct.iter_unpack(self.order + self._entry, _exactly(self.stream, at + head, count * size))
+        content = _exactly(self.stream, at + head, count * size)
         tags: dict[int, tuple[int, int, int]] = {}
         inline = struct.calcsize(self._offset)
-        for i, (tag, kind, n, value) in enumerate(entries):
+        for i, (tag, kind, n, value) in enumerate(struct.iter_unpack(self.order + self._entry, content)):
             if tag in _WANTED:
                 there = n * _TYPE_BYTES.get(kind, 1) <= inline
                 tags.setdefault(tag, (kind, n, at + head + (i + 1) * size - inline if there else value))
         following = self._unpacked(self._offset, at + head + count * size)
-        return Directory(self, tags, last=following == 0), following
+        return Directory(self, tags, at + head, content, last=following == 0), following
 
     def _unpacked(self, layout: str, at: int) -> int:
         content = _exactly(self.stream, at, struct.calcsize(self.order + layout))
