@@ -127,6 +127,8 @@ class Resample:
     """What becomes of voxels that are NaN: refuse, propagate (NaN near them) or fill (values from around)."""
     dtype: str = "float32"
     """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN."""
+    nifti2: bool = False
+    """Write NIfTI-2, which fewer tools open; NIfTI-1 rounds numbers of the affine, by 6e-8 of themselves at most."""
     max_gigabytes: float = 8.0
     """The most memory that one volume may take: IN as it is read, or the result as it is computed or written."""
 
@@ -158,7 +160,7 @@ class Resample:
         target = None if self.like is None else describe(self.like)
         dtype = _result_type(self.dtype, source)
         working = torch.float64 if torch.float64 in (dtype, source.dtype) else torch.float32
-        check_saveable(self.output, batched=len(source.shape) == 5)
+        check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)
         limit = self._limit()
         shape = [*source.shape[:-3], *self._new_size(source, target)]
         _check_memory(shape, max(working.itemsize, dtype.itemsize), limit)
@@ -167,7 +169,19 @@ class Resample:
         if target is not None:  # a grid without samples: one voxel, shown over and over
             grid = {"like": Volume.with_geometry(torch.zeros(()).expand(target.shape[-3:]), target.geometry)}
         result = resample(volume, self.method, boundary=self.boundary, dtype=working, nan=self.nan, **grid)
-        save_volume(_converted(result, dtype), self.output)
+        save_volume(_converted(result, dtype), self.output, nifti2=self.nifti2)
+        self._tell_rounding(result)
+
+    def _tell_rounding(self, result: Volume) -> None:
+        """What is lost of the affine, where something is: NIfTI-1 holds it in float32."""
+        from filterlab.io import nifti
+        from filterlab.io.volumes import format_of
+
+        if format_of(self.output).name == "NIfTI" and not self.nifti2 and nifti.fits_nifti1(result):
+            lost = nifti.rounding(result.affine)
+            if lost > 0:
+                what = f"{self.output}: the affine is rounded to float32, by {lost:.0e} of itself; --nifti2 keeps it"
+                print(f"filterlab: {what}", file=sys.stderr)
 
     def _limit(self) -> int:
         """Bytes that one volume may take."""

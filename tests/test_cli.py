@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -267,6 +268,24 @@ def test_resample_like_another_volume(volume_file: Path, tmp_path: Path) -> None
     expected = resample(load_volume(volume_file), like=load_volume(like))
     assert torch.equal(load_volume(out).samples, expected.samples)
     assert np.array_equal(load_volume(out).affine, load_volume(like).affine)
+
+
+def test_resample_tells_what_nifti_1_rounds(
+    volume_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, line = tmp_path / "out.nii.gz", ["resample", str(volume_file), "-o", str(tmp_path / "out.nii.gz"), "--spacing"]
+    assert main([*line, "0.7", "0.7", "0.7"]) == 0
+    assert re.search(
+        r"out\.nii\.gz: the affine is rounded to float32, by \de-08 of itself; --nifti2", capsys.readouterr().err
+    )
+    exact = resample(load_volume(volume_file), spacing=(0.7, 0.7, 0.7)).affine
+    assert np.array_equal(load_volume(out).affine, exact.astype(np.float32))
+    assert main([*line, "0.7", "0.7", "0.7", "--nifti2"]) == 0
+    assert np.array_equal(load_volume(out).affine, exact)
+    assert main([*line, "0.5", "0.5", "0.5"]) == 0  # exact in float32
+    assert capsys.readouterr().err == ""
+    assert main(["resample", str(volume_file), "-o", str(tmp_path / "a.nrrd"), "--shape", *"345", "--nifti2"]) == 1
+    assert "for NIfTI-2; got NRRD" in capsys.readouterr().err
 
 
 def test_resample_to_integers_rounds_and_clips(tmp_path: Path) -> None:

@@ -1,9 +1,9 @@
-"""Volume files with damaged bytes, by the hundred thousand, in a process of their own.
+"""Volume files that are damaged or forged, by the hundred thousand, in a process of their own.
 
 That process may neither hang (an alarm, and a watchdog outside), nor take memory (a limit on its address space), nor
 crash (then the case that it was at is known). A case is told again by its number:
 
-    python -m experiments.extremes.fuzzing SEED FIRST COUNT      prints what came of it as JSON
+    python -m experiments.extremes.fuzzing damaged|forged SEED FIRST COUNT      prints what came of it as JSON
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 import tracemalloc
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -26,19 +26,32 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
+from experiments.extremes.forged import FORGERS, Pen
 from experiments.extremes.mutations import edited, random_edits
-from experiments.extremes.originals import Original, originals
+from experiments.extremes.originals import originals
 from filterlab.io import VolumeFileError, load_volume
 from filterlab.io.volumes import files_of
 
 MAX_BYTES = 2**20  # what a volume may take here, as `load_volume` is told
-MAX_PEAK = 8 * MAX_BYTES  # what reading it may take in all: blocks of 1 MiB before and behind decompression
+BASE_PEAK, PEAK_OF_FILE, PEAK_OF_SAMPLES = 4 * 2**20, 2, 3  # memory: that, and so many times the file and max_bytes
+# CPU time: that, and so much for every byte of both
+BASE_SECONDS, SECONDS_OF_FILE, SECONDS_OF_SAMPLES = 1.0, 4e-6, 5e-8
 ADDRESS_SPACE = 2**28  # more than the process has when it begins; past it, allocating fails
-SECONDS = 10.0  # a case that takes longer hangs
+SECONDS = 20.0  # a case that takes longer hangs
 _SILENCE = 120.0  # a process that tells of nothing for so long hangs where no alarm reaches it
 _TOLD_EVERY = 1000
 _MEASURED_EVERY = 16  # cases; counting allocations takes longer than reading
 PROGRAM = (sys.executable, "-m", "experiments.extremes.fuzzing")
+
+
+def allowed_peak(size: int) -> int:
+    """Bytes of memory that reading a file (and its sidecar) of that size may take, samples included."""
+    return BASE_PEAK + PEAK_OF_FILE * size + PEAK_OF_SAMPLES * MAX_BYTES
+
+
+def allowed_seconds(size: int) -> float:
+    """Seconds of CPU time that it may take."""
+    return BASE_SECONDS + SECONDS_OF_FILE * size + SECONDS_OF_SAMPLES * MAX_BYTES
 
 
 class _HangsError(BaseException):
@@ -51,43 +64,46 @@ class Fuzzed:
 
     Attributes:
         cases: how many were tried; read: were volumes nevertheless; refused: with a VolumeFileError.
-        seconds: the most that one case took.
+        true: how many of those that were read had to be, with the samples that went in.
+        seconds: the most CPU time that one case took.
         bytes: the most memory that one of those took, of which it was measured: what Python and NumPy allocated.
+        time_share, memory_share: the same in units of what is allowed for a file of its size.
         findings: what must not be, each with the number of its case.
     """
 
     cases: int = 0
     read: int = 0
     refused: int = 0
+    true: int = 0
     seconds: float = 0.0
     bytes: int = 0
+    time_share: float = 0.0
+    memory_share: float = 0.0
     findings: list[str] = field(default_factory=list)
 
     def add(self, other: Fuzzed) -> None:
         """Counts another one's cases too."""
-        self.cases, self.read, self.refused = (
-            self.cases + other.cases,
-            self.read + other.read,
-            self.refused + other.refused,
-        )
-        self.seconds, self.bytes = max(self.seconds, other.seconds), max(self.bytes, other.bytes)
-        self.findings += other.findings
+        for name in ("cases", "read", "refused", "true", "findings"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        for name in ("seconds", "bytes", "time_share", "memory_share"):
+            setattr(self, name, max(getattr(self, name), getattr(other, name)))
 
 
-def fuzzed(count: int, seed: int, program: Sequence[str] = PROGRAM) -> Fuzzed:
+def fuzzed(source: str, count: int, seed: int, program: Sequence[str] = PROGRAM) -> Fuzzed:
     """The cases 0 … count − 1 of a seed, in processes of their own: a new one where one was lost.
 
     Args:
+        source: which files, of SOURCES.
         count: cases.
-        seed: of the edits.
-        program: what is started with SEED, FIRST, COUNT and the name of a file for its progress.
+        seed: of the random numbers.
+        program: what is started with the source, SEED, FIRST, COUNT and the name of a file for its progress.
     """
     total, first = Fuzzed(), 0
     with TemporaryDirectory() as folder:
         progress = Path(folder) / "progress"
         while first < count:
             progress.write_text(json.dumps({"case": first, **asdict(Fuzzed())}))
-            ended = _watched([*program, str(seed), str(first), str(count - first), str(progress)], progress)
+            ended = _watched([*program, source, str(seed), str(first), str(count - first), str(progress)], progress)
             told = json.loads(progress.read_text())
             case = told.pop("case")
             total.add(Fuzzed(**told))
@@ -120,23 +136,74 @@ def _watched(command: list[str], progress: Path) -> str | None:
 # --- inside that process ----------------------------------------------------------------------------------------------
 
 
-def main(seed: int, first: int, count: int, progress: str | None = None) -> None:
+@dataclass(frozen=True)
+class Attempt:
+    """A file that is about to be read.
+
+    Attributes:
+        name: of its kind.
+        path, frame: what is loaded.
+        size: bytes of all its files.
+        samples: what must be found in it; None: a volume or a VolumeFileError.
+        heavy: whether its memory is worth a look.
+    """
+
+    name: str
+    path: Path
+    frame: int | None
+    size: int
+    samples: np.ndarray | None = None
+    heavy: bool = False
+
+
+def _damaged(seed: int, folder: Path) -> Callable[[int], Attempt]:
+    """Edits of valid files, kind after kind."""
+    known = list(originals().values())
+    places = [folder / str(i) for i in range(len(known))]
+    for place, original in zip(places, known, strict=True):
+        original.write(place)
+
+    def attempt(case: int) -> Attempt:
+        original, place = known[case % len(known)], places[case % len(known)]
+        original.damage(place, edited(original.content, random_edits(np.random.default_rng([seed, case]))))
+        return Attempt(original.name, place / original.path, original.frame, sum(map(len, original.files.values())))
+
+    return attempt
+
+
+def _forged(seed: int, folder: Path) -> Callable[[int], Attempt]:
+    """Forged files, kind after kind."""
+    kinds = list(FORGERS.items())
+    before: list[Path] = []
+
+    def attempt(case: int) -> Attempt:
+        name, write = kinds[case % len(kinds)]
+        forged = write(Pen(seed * 2**32 + case))
+        while before:
+            before.pop().unlink()
+        for file, content in forged.files.items():
+            (folder / file).write_bytes(content)
+            before.append(folder / file)
+        heavy = "heavy" in forged.told
+        told = f"{name} ({forged.told})"
+        return Attempt(told, folder / forged.path, forged.frame, forged.size, forged.samples, heavy)
+
+    return attempt
+
+
+SOURCES: dict[str, Callable[[int, Path], Callable[[int], Attempt]]] = {"damaged": _damaged, "forged": _forged}
+
+
+def main(source: str, seed: int, first: int, count: int, progress: str | None = None) -> None:
     """Tries the cases; tells of them in a file every now and then, and at the end."""
     faulthandler.enable()
     torch.set_num_threads(1)
     limit_memory(ADDRESS_SPACE)
-    known = list(originals().values())
     result = Fuzzed()
     with TemporaryDirectory() as folder, _alarmed():
-        places = [Path(folder) / str(i) for i in range(len(known))]
-        for place, original in zip(places, known, strict=True):
-            original.write(place)
+        prepare = SOURCES[source](seed, Path(folder))
         for case in range(first, first + count):
-            which = case % len(known)
-            if case % _MEASURED_EVERY == 0:
-                tracemalloc.start()
-            _try(known[which], places[which], np.random.default_rng([seed, case]), f"case {case}", result)
-            tracemalloc.stop()
+            _try(prepare(case), case, result)
             if progress is not None and (case + 1) % _TOLD_EVERY == 0:
                 _tell(progress, case + 1, result)
     _tell(progress, first + count, result)
@@ -151,42 +218,62 @@ def _tell(progress: str | None, case: int, result: Fuzzed) -> None:
         os.replace(f"{progress}.new", progress)
 
 
-def _try(original: Original, place: Path, rng: np.random.Generator, name: str, result: Fuzzed) -> None:
-    original.damage(place, edited(original.content, random_edits(rng)))
-    start = time.perf_counter()
-    found = None
+def _try(attempt: Attempt, case: int, result: Fuzzed) -> None:
+    """Reads a file and looks at the time; reads some once more and looks at the memory."""
+    start = time.process_time()
+    found = _read(attempt, result)
+    seconds = time.process_time() - start
+    result.cases += 1
+    result.seconds, share = max(result.seconds, seconds), seconds / allowed_seconds(attempt.size)
+    result.time_share = max(result.time_share, share)
+    if share > 1:
+        found = found or f"{seconds:.2f} s for {attempt.size} bytes"
+    if found is None and (case % _MEASURED_EVERY == 0 or attempt.heavy):
+        tracemalloc.start()
+        found = _read(attempt, Fuzzed(), thoroughly=True)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        result.bytes, share = max(result.bytes, peak), peak / allowed_peak(attempt.size)
+        result.memory_share = max(result.memory_share, share)
+        if share > 1:
+            found = found or f"{peak} bytes were allocated for {attempt.size}"
+    if found is not None:
+        result.findings.append(f"case {case}, {attempt.name}: {found}"[:400])
+
+
+def _read(attempt: Attempt, result: Fuzzed, thoroughly: bool = False) -> str | None:
+    """Reads the volume or is refused; what is wrong with that."""
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
     try:
-        found = _unsound(original, place)
+        found = _unsound(attempt, thoroughly)
         result.read += 1
+        result.true += attempt.samples is not None
+        return found
     except VolumeFileError as error:
         result.refused += 1
-        if "expected" not in str(error) or "; got " not in str(error) or str(place) not in str(error):
-            found = f"a message that does not tell: {error}"
+        if attempt.samples is not None:
+            return f"a true file was refused: {error}"
+        if "expected" not in str(error) or "; got " not in str(error) or str(attempt.path.parent) not in str(error):
+            return f"a message that does not tell: {error}"
     except _HangsError:
-        found = f"hangs for {SECONDS} s"
+        return f"hangs for {SECONDS} s"
     except Exception as error:
-        found = f"{type(error).__name__}: {error}"
+        return f"{type(error).__name__}: {error}"
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-    peak = tracemalloc.get_traced_memory()[1]
-    if peak > MAX_PEAK:
-        found = found or f"{peak} bytes were allocated"
-    result.cases += 1
-    result.seconds, result.bytes = max(result.seconds, time.perf_counter() - start), max(result.bytes, peak)
-    if found is not None:
-        result.findings.append(f"{name}, {original.name}: {found}"[:400])
+    return None
 
 
-def _unsound(original: Original, place: Path) -> str | None:
+def _unsound(attempt: Attempt, thoroughly: bool) -> str | None:
     """Reads the volume; what is wrong with it."""
-    path = place / original.path
-    volume = load_volume(path, frame=original.frame, max_bytes=MAX_BYTES)
+    volume = load_volume(attempt.path, frame=attempt.frame, max_bytes=MAX_BYTES)
     if volume.samples.numel() * volume.samples.element_size() > MAX_BYTES:
         return f"{tuple(volume.shape)} is more than {MAX_BYTES} bytes"
     if not (np.isfinite(volume.affine).all() and math.isfinite(min(volume.spacing)) and min(volume.spacing) > 0):
         return f"a volume with the affine {volume.affine.tolist()}"
-    if not all(file.is_file() for file in files_of(path)):
+    if attempt.samples is not None and not np.array_equal(volume.samples.numpy(), attempt.samples):
+        return "other samples than went in"
+    if thoroughly and not all(file.is_file() for file in files_of(attempt.path)):
         return "it names files that are not there"
     return None
 
@@ -216,4 +303,4 @@ def limit_memory(more: int) -> bool:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), *sys.argv[4:5])
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]), *sys.argv[5:6])

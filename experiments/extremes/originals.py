@@ -77,10 +77,10 @@ def _inside(outer: Original, name: str, content: bytes, pack: Packer) -> Origina
     return replace(outer, name=name, content=content, pack=pack)
 
 
-def _saved(name: str, samples: np.ndarray = SAMPLES) -> dict[str, bytes]:
+def _saved(name: str, **options: bool) -> dict[str, bytes]:
     """The files that `save_volume` writes."""
     with TemporaryDirectory() as folder:
-        save_volume(Volume(torch.from_numpy(samples.copy()), affine=AFFINE), Path(folder) / name)
+        save_volume(Volume(torch.from_numpy(SAMPLES.copy()), affine=AFFINE), Path(folder) / name, **options)
         return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
 
 
@@ -203,10 +203,7 @@ def _nifti() -> list[Original]:
         return []
     plain = _plain("NIfTI-1", "a.nii", _saved("a.nii")["a.nii"])
     packed = _plain("NIfTI-1 gzip", "a.nii.gz", _gzip(plain.content))
-    with_two = Volume(torch.from_numpy(SAMPLES.copy()), spacing=(0.1, 0.2, 0.3))  # no float32: becomes NIfTI-2
-    with TemporaryDirectory() as folder:
-        save_volume(with_two, Path(folder) / "a.nii")
-        second = (Path(folder) / "a.nii").read_bytes()
+    second = _saved("a.nii", nifti2=True)["a.nii"]
     scaled = bytearray(plain.content)
     struct.pack_into("<ff", scaled, 112, 2.0, -1.0)
     series = bytearray(plain.content + SAMPLES.tobytes())

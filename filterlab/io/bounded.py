@@ -1,7 +1,8 @@
 """What every volume format shares: a header that is checked before it is believed, and reading that cannot run away.
 
 A file is untrusted input. Before anything of the size that a header claims is allocated, the claim is compared with
-the length of the file (or, compressed, with what that length can expand to) and with the caller's `max_bytes`.
+the length of the file (or, deflated, with what that length can expand to) and with the caller's `max_bytes`. What is
+decompressed grows as its data arrive, and ends with the first byte beyond the claim.
 """
 
 from __future__ import annotations
@@ -28,9 +29,11 @@ BLOCK = 2**20
 MAX_HEADER_BYTES = 2**20
 MAX_AXIS = 2**31 - 1
 
-# The most that one compressed byte can become: deflate 258 bytes per 2 bits; bzip2 a 900 kB run-length coded block
-# (255 bytes from 5) in some 40 bytes.
-EXPANSION = {"raw": 1, "gzip": 1032, "bzip2": 1_200_000}
+MAX_SKIP = 2**26  # bytes passed over in bzip2 data, of which a few hold any number
+
+# The most that one compressed byte can become: of deflate 258 bytes per 2 bits. Of bzip2 a million and more (268 MB of
+# zeros are 208 bytes): no ratio tells true claims from false ones.
+EXPANSION = {"raw": 1, "deflate": 1032, "gzip": 1032}
 
 # Stored type -> type of the samples. torch has no arithmetic for uint16 and uint32: they widen to the next signed type.
 SAMPLE_TYPES = {
@@ -232,9 +235,11 @@ class Stored:
         expected = f"{claimed} bytes of samples for {self.shape} {self.dtype.name}"
         if self.encoding == "raw" and available != claimed:
             raise VolumeFileError(self.header, expected, f"{available} bytes")
-        if claimed > EXPANSION[self.encoding] * available:
+        if self.encoding in EXPANSION and claimed > EXPANSION[self.encoding] * available:
             got = f"{available} bytes of {self.encoding} data, which cannot hold that many"
             raise VolumeFileError(self.header, expected, got)
+        if self.encoding not in EXPANSION and self.skip > MAX_SKIP:
+            raise VolumeFileError(self.header, f"at most {MAX_SKIP} bytes before the samples", self.skip)
 
     def read(self) -> np.ndarray:
         """The samples in native byte order, writable and contiguous."""

@@ -28,6 +28,7 @@ from pydantic_core import to_jsonable_python
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 MAX_BYTES = 2**20
+MAX_SIDECAR_BYTES = 2**14  # of a small file beside a volume, which is read before anyone trusts it
 MAX_DEPTH = 32
 MAX_NODES = 100_000
 
@@ -67,10 +68,16 @@ def unknown_name(what: str, name: object, known: Iterable[str]) -> str:
     known = [str(k) for k in known]
     close = difflib.get_close_matches(str(name).lower(), known, n=1, cutoff=0.5)
     hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"unknown {what} {name!r}; {hint}known {what}s: {', '.join(known) or '(none)'}"
+    return f"unknown {what} {_shown(name)}; {hint}known {what}s: {', '.join(known) or '(none)'}"
 
 
-def load_config(path: str | os.PathLike[str], model: type[Model], overrides: Mapping[str, str] | None = None) -> Model:
+def load_config(
+    path: str | os.PathLike[str],
+    model: type[Model],
+    overrides: Mapping[str, str] | None = None,
+    *,
+    max_bytes: int = MAX_BYTES,
+) -> Model:
     """The configuration in a YAML file, checked against `model`.
 
     Args:
@@ -79,13 +86,14 @@ def load_config(path: str | os.PathLike[str], model: type[Model], overrides: Map
             `info.context["folder"]`, for paths that are relative to it.
         overrides: {"camera.fov": "30", "methods[2]": "notch"}: the dotted path of a key and its new value as YAML text,
             set before validation.
+        max_bytes: the most that the file may hold. Parsing takes some 1 kB of memory for every value of two bytes.
 
     Raises:
         ConfigError: every problem, each with its place, the path of the key, what was expected and what came.
         OSError: the file cannot be read.
     """
     path = Path(path)
-    document = _parse(_read(path), str(path))
+    document = _parse(_read(path, max_bytes), str(path))
     for key, text in (overrides or {}).items():
         _override(document, model, key, text)
     return _validated(document, model, path.parent)
@@ -206,14 +214,14 @@ for _tag, _pattern, _first in _RESOLVERS:
     _Dumper.add_implicit_resolver(_tag, _pattern, list(_first))
 
 
-def _read(path: Path) -> str:
+def _read(path: Path, max_bytes: int) -> str:
     if not path.is_file():
         problem = "a folder or device" if path.exists() else "no file"
         raise FileNotFoundError(f"cannot read {path}: expected a YAML file; got {problem}")
     with path.open("rb") as file:
-        content = file.read(MAX_BYTES + 1)
-    if len(content) > MAX_BYTES:
-        raise ConfigError([Problem(str(path), "", f"expected at most {MAX_BYTES} bytes; got more")])
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise ConfigError([Problem(str(path), "", f"expected at most {max_bytes} bytes; got more")])
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -38,6 +38,7 @@ from filterlab.io.bounded import (
 )
 from filterlab.volume import Volume
 
+MAX_NIFTI1_AXIS = 32767
 HEADER_BYTES = {348: 352, 540: 544}  # sizeof_hdr -> bytes up to the first possible voxel
 _WRITTEN = ("uint8", "int8", "int16", "int32", "int64", "float32", "float64")
 
@@ -203,23 +204,40 @@ def _fields(header: Any, slope: float, intercept: float) -> dict[str, str]:
     return {k: v for k, v in fields.items() if v}
 
 
-def write(volume: Volume, path: Path) -> None:
-    """Writes `.nii` or `.nii.gz` with an sform.
+def rounding(affine: np.ndarray) -> float:
+    """How much the nearest float32 affine differs: the largest change of an entry ÷ that entry, at most 2⁻²⁴ = 6e-8.
 
-    NIfTI-1, whose affine is float32; NIfTI-2 where float32 would change the affine or an axis is longer than 32767.
-    float16 and bfloat16, which the format lacks, become float32.
+    Entries far below the smallest voxel size, of which float32 may hold nothing, count relative to that; what float32
+    cannot hold at all is infinitely far.
+    """
+    with np.errstate(over="ignore"):
+        change = np.abs(affine.astype(np.float32).astype(np.float64) - affine)
+    finest = np.sqrt((affine[:3, :3] ** 2).sum(axis=0).min())
+    return float((change / np.maximum(np.abs(affine), finest)).max())
+
+
+def fits_nifti1(volume: Volume) -> bool:
+    """Whether NIfTI-1 holds the volume: no axis beyond 32767 voxels, no number of the affine beyond float32."""
+    return max(volume.size) <= MAX_NIFTI1_AXIS and rounding(volume.affine) <= 2**-24
+
+
+def write(volume: Volume, path: Path, nifti2: bool = False) -> None:
+    """Writes `.nii` or `.nii.gz` with an sform: NIfTI-1, which every tool opens, with the nearest float32 affine.
+
+    NIfTI-2, which holds the affine bit for bit, where it is asked for or NIfTI-1 cannot hold the volume (see
+    `fits_nifti1`). float16 and bfloat16, which the format lacks, become float32.
     """
     nibabel = require_nibabel(path)
     array = storable(path, volume, _WRITTEN)
     affine = volume.affine
-    fits = max(volume.size) <= 32767 and np.array_equal(affine.astype(np.float32).astype(np.float64), affine)
-    header = nibabel.Nifti1Header() if fits else nibabel.Nifti2Header()
+    first = not nifti2 and fits_nifti1(volume)
+    header = nibabel.Nifti1Header() if first else nibabel.Nifti2Header()
     header.set_data_shape(volume.size)
     header.set_data_dtype(array.dtype)
     header.set_zooms(volume.spacing)
     header.set_sform(affine, code="aligned")
-    header["magic"] = b"n+1" if fits else b"n+2\0\r\n\x1a\n"
-    header["vox_offset"] = HEADER_BYTES[348 if fits else 540]
+    header["magic"] = b"n+1" if first else b"n+2\0\r\n\x1a\n"
+    header["vox_offset"] = HEADER_BYTES[348 if first else 540]
     front = io.BytesIO()
     header.write_to(front)
     start = front.getvalue().ljust(int(header["vox_offset"]), b"\0")

@@ -64,6 +64,11 @@ _PLAIN = ("scanner-xyz", "3d-right-handed", "3d-left-handed")
 _ALIASES = {"datafile": "data file", "byteskip": "byte skip", "lineskip": "line skip", "axismins": "axis mins"}
 _ALIASES |= {"axismaxs": "axis maxs", "centers": "centerings", "blocksize": "block size"}
 
+MAX_FIELDS = 1000
+MAX_VALUE = 4096  # characters of a value that is taken apart; 16 vectors take a third of it
+_TAKEN_APART = ("type", "dimension", "sizes", "encoding", "endian", "data file", "byte skip", "line skip", "centerings")
+_TAKEN_APART += ("space", "space dimension", "space directions", "space origin", "spacings", "axis mins", "axis maxs")
+
 
 def read_header(path: Path) -> VolumeHeader:
     """The checked header of an NRRD file. Raises VolumeFileError."""
@@ -74,7 +79,7 @@ def read_header(path: Path) -> VolumeHeader:
     if not 1 <= dimension <= 16:
         raise VolumeFileError(path, "a dimension from 1 to 16", dimension)
     sizes = check_size(path, [integer(path, "sizes", t) for t in _items(path, fields, "sizes", dimension)])
-    axes = _spatial_axes(path, sizes)
+    axes = _spatial_axes(path, sizes, fields)
     size = tuple(sizes[a] for a in axes)
     dtype = _dtype(path, fields)
     stored = _stored(path, fields, end, size[::-1], dtype)
@@ -113,6 +118,10 @@ def _fields(path: Path, file: BinaryIO) -> dict[str, str]:
         name = _ALIASES.get(name.lower(), name.lower())
         if not colon or name in fields:
             raise VolumeFileError(path, "every header line to be `field: value`, once", repr(text[:80]))
+        if len(fields) == MAX_FIELDS:
+            raise VolumeFileError(path, f"at most {MAX_FIELDS} fields in the header", "more")
+        if name in _TAKEN_APART and len(value) > MAX_VALUE:
+            raise VolumeFileError(path, f"at most {MAX_VALUE} characters in `{name}`", len(value))
         fields[name] = value.strip()
     if "data file" not in fields:
         raise VolumeFileError(path, "an empty line after the header, then samples", "the end of the file")
@@ -132,10 +141,16 @@ def _items(path: Path, fields: dict[str, str], name: str, count: int) -> list[st
     return items
 
 
-def _spatial_axes(path: Path, sizes: tuple[int, ...]) -> tuple[int, int, int]:
-    """The three axes that are kept: all, or those that are left without axes of one entry (channels, time)."""
+def _spatial_axes(path: Path, sizes: tuple[int, ...], fields: dict[str, str]) -> tuple[int, int, int]:
+    """The three axes that are kept: all; those with a direction; or those that have more than one entry.
+
+    The others (channels, time) have one.
+    """
     axes = [a for a in range(len(sizes)) if len(sizes) == 3 or sizes[a] > 1]
-    if len(axes) != 3:
+    if len(sizes) != 3 and "space directions" in fields:
+        directions = _vectors(path, fields, "space directions")
+        axes = sorted({a for a, direction in enumerate(directions) if direction is not None} | set(axes))
+    if len(axes) != 3 or axes[-1] >= len(sizes):
         raise VolumeFileError(path, "three axes of one value per voxel (no images, channels or time)", f"sizes {sizes}")
     return axes[0], axes[1], axes[2]
 

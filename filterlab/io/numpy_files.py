@@ -42,7 +42,7 @@ from filterlab.io.bounded import (
     sample_dtype,
     scaled,
 )
-from filterlab.io.config import ConfigError, StrictModel, dump_config, load_config
+from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, dump_config, load_config
 from filterlab.volume import Volume
 
 Count = Annotated[int, Field(ge=1)]
@@ -50,6 +50,8 @@ Row = tuple[float, float, float, float]
 _GEOMETRY = ("affine", "spacing", "origin")
 _SUFFIX = ".npy"
 MAX_NPY_HEADER = 2**16
+MAX_NPY_TEXT = 1024  # of it, padding aside, which NumPy evaluates as Python: 0.2 s and more for ten times that
+MAX_DIRECTORY = 2**18  # bytes; of an entry, 46 and more, zipfile makes an object of 700
 
 
 class GeometrySidecar(StrictModel):
@@ -71,9 +73,12 @@ def _array_header(path: Path, stream: BinaryIO) -> tuple[tuple[int, ...], bool, 
         raise VolumeFileError(path, "a valid npy header, version 1.0 or 2.0", f"{start!r}")
     length = stream.read(2 * version[0])
     count = int.from_bytes(length, "little")
-    if count > MAX_NPY_HEADER:
+    if len(length) != 2 * version[0] or count > MAX_NPY_HEADER:
         raise VolumeFileError(path, f"a valid npy header of at most {MAX_NPY_HEADER} bytes", count)
-    header = io.BytesIO(length + stream.read(count))
+    text = stream.read(count).strip()
+    if len(text) > MAX_NPY_TEXT:
+        raise VolumeFileError(path, f"a valid npy header of at most {MAX_NPY_TEXT} characters", len(text))
+    header = io.BytesIO((len(text) + 1).to_bytes(len(length), "little") + text + b"\n")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     try:
         with warnings.catch_warnings():
@@ -120,7 +125,7 @@ def _sidecar_affine(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     if not sidecar.exists():
         return np.eye(4)
     try:
-        found = load_config(regular_file(sidecar), GeometrySidecar)
+        found = load_config(regular_file(sidecar), GeometrySidecar, max_bytes=MAX_SIDECAR_BYTES)
     except ConfigError as error:
         raise VolumeFileError(sidecar, "the geometry of the samples", str(error)) from None
     if found.size[::-1] != shape[-3:]:
@@ -131,11 +136,30 @@ def _sidecar_affine(path: Path, shape: tuple[int, ...]) -> np.ndarray:
 # --- npz --------------------------------------------------------------------------------------------------------------
 
 
+class _Archive(io.FileIO):
+    """A file of which no more than MAX_DIRECTORY bytes are read at once until its directory has been read.
+
+    zipfile makes objects of all entries before anyone can ask how many there are.
+    """
+
+    directory_read = False
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        size = -1 if size is None else size
+        left = os.fstat(self.fileno()).st_size - self.tell()
+        if not self.directory_read and min(left, left if size < 0 else size) > MAX_DIRECTORY:
+            raise VolumeFileError(
+                Path(str(self.name)), f"a directory of at most {MAX_DIRECTORY} bytes", min(left, size)
+            )
+        return super().read(size)
+
+
 @contextmanager
 def _archive(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]]:
     """The archive and its arrays by name; damage anywhere in it becomes VolumeFileError."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with _Archive(path) as file, zipfile.ZipFile(file) as archive:
+            file.directory_read = True
             yield archive, {i.filename.removesuffix(_SUFFIX): i for i in archive.infolist()}
     except VolumeFileError:
         raise
@@ -149,7 +173,7 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Bina
     """An open member whose claimed sizes are plausible."""
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise VolumeFileError(path, f"{info.filename} stored or deflated", f"zip method {info.compress_type}")
-    factor = EXPANSION["gzip"] if info.compress_type == zipfile.ZIP_DEFLATED else 1
+    factor = EXPANSION["deflate"] if info.compress_type == zipfile.ZIP_DEFLATED else 1
     present = min(info.compress_size, path.stat().st_size)
     if info.file_size > factor * present:
         raise VolumeFileError(

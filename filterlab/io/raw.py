@@ -31,7 +31,7 @@ from filterlab.io.bounded import (
     sample_dtype,
     scaled,
 )
-from filterlab.io.config import ConfigError, StrictModel, load_config, unknown_name
+from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, load_config, unknown_name
 
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -67,7 +67,7 @@ def read_header(path: Path) -> VolumeHeader:
     if not sidecar.exists():
         raise VolumeFileError(path, f"a sidecar {sidecar.name} with size, dtype, …", "no such file")
     try:
-        found = load_config(regular_file(sidecar), RawSidecar)
+        found = load_config(regular_file(sidecar), RawSidecar, max_bytes=MAX_SIDECAR_BYTES)
     except ConfigError as error:
         raise VolumeFileError(sidecar, "a description of raw samples", str(error)) from None
     if sidecar != path and found.file not in (None, path.name):

@@ -7,7 +7,7 @@ of one entry are dropped from NRRD and NIfTI). Of a time series in NIfTI, `frame
 
 Geometry is the 4×4 affine from voxel (x, y, z) to world. NIfTI is in RAS (x right, y anterior, z superior, mm); NRRD
 files that declare an anatomical space are converted to RAS; everything else is taken as it is. A round trip through any
-format that is written keeps the affine bit for bit.
+format that is written keeps the affine bit for bit, but NIfTI-1, which holds it in float32.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from torch import Tensor
 from filterlab.io import nifti, nrrd, numpy_files, raw, tiff
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import VolumeFileError, VolumeHeader, beside, regular_file
-from filterlab.io.config import load_config, unknown_name
+from filterlab.io.config import MAX_SIDECAR_BYTES, load_config, unknown_name
 from filterlab.volume import Volume, as_volume
 
-Writer = Callable[[Volume, Path], None]
+Writer = Callable[..., None]
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ def format_of(path: Path) -> VolumeFormat:
     raise VolumeFileError(path, "a volume file", unknown_name("ending", path.suffix, endings))
 
 
-def check_saveable(path: str | os.PathLike[str], *, batched: bool = False) -> Path:
+def check_saveable(path: str | os.PathLike[str], *, batched: bool = False, nifti2: bool = False) -> Path:
     """The path, once it is known that a volume can be written under such a name; for calls before long work.
 
     Raises:
         VolumeFileError: an ending that is not written (lists those that are), a batch (N, C, …) in a format that holds
-            (D, H, W) only, or a missing package.
+            (D, H, W) only, NIfTI-2 under another ending, or a missing package.
     """
     path = Path(path)
     endings = [e for f in FORMATS.values() for e in f.written]
@@ -85,6 +85,8 @@ def check_saveable(path: str | os.PathLike[str], *, batched: bool = False) -> Pa
     name = format_of(path).name
     if batched and name not in BATCHED:
         raise VolumeFileError(path, f"{' or '.join(BATCHED)} for samples (N, C, D, H, W)", name)
+    if nifti2 and name != "NIfTI":
+        raise VolumeFileError(path, f"a name that ends in {' or '.join(FORMATS['NIfTI'].written)} for NIfTI-2", name)
     if name == "NIfTI":
         nifti.require_nibabel(path)
     return path
@@ -106,7 +108,7 @@ def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:
     elif name == "raw":
         describe(path)
         sidecar = path if path.name.lower().endswith(".yaml") else path.with_name(path.name + ".yaml")
-        data = load_config(sidecar, raw.RawSidecar).file or sidecar.name[: -len(".yaml")]
+        data = load_config(sidecar, raw.RawSidecar, max_bytes=MAX_SIDECAR_BYTES).file or sidecar.name[: -len(".yaml")]
         found = [sidecar, beside(sidecar, data)]
     return tuple(file.resolve() for file in found)
 
@@ -138,7 +140,9 @@ def load_volume(path: str | os.PathLike[str], *, frame: int | None = None, max_b
     Args:
         path: NRRD, NIfTI, TIFF, .npy, .npz, or .raw with a sidecar (`FORMATS`).
         frame: which volume of a NIfTI time series, from 0; needed there, and refused for every other file.
-        max_bytes: the most that the samples may take in memory; default 8 GiB.
+        max_bytes: the most that the samples may take in memory; default 8 GiB. Reading takes at most 4 MiB + 2 × the
+            file + 3 × `max_bytes` of memory and 1 s + 4 µs × the file + 50 ns × `max_bytes` of one core, whatever the
+            file says (`docs/extremes.md`).
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -149,26 +153,34 @@ def load_volume(path: str | os.PathLike[str], *, frame: int | None = None, max_b
     return Volume.with_geometry(header.read(max_bytes), header.geometry)
 
 
-def save_volume(volume: Volume | Tensor, path: str | os.PathLike[str]) -> None:
+def save_volume(volume: Volume | Tensor, path: str | os.PathLike[str], *, nifti2: bool = False) -> None:
     """Writes a volume: `.nrrd` (gzip), `.nii`, `.nii.gz`, `.npy` (geometry in NAME.npy.yaml), `.npz`.
 
     A bare tensor (D, H, W) or (N, C, D, H, W) is a volume whose voxel centres are the integers.
 
-    The file appears whole or not at all. A round trip keeps samples and affine bit for bit; float16 (in NRRD, NIfTI)
-    and bfloat16 come back as float32. Gradients are not saved.
+    The file appears whole or not at all. A round trip keeps samples and affine bit for bit; but NIfTI-1 rounds every
+    entry of the affine to float32, which changes it by at most 6e-8 of itself. float16 (in NRRD, NIfTI) and bfloat16
+    come back as float32. Gradients are not saved.
+
+    Args:
+        volume, path: what is written where; the ending tells the format.
+        nifti2: write NIfTI-2, which keeps the affine bit for bit and which fewer tools open. Without it NIfTI-1 is
+            written wherever it can hold the volume: up to 32767 voxels along an axis, an affine within float32.
 
     Raises:
-        VolumeFileError: an ending that is not written, or a type or batch (N, C, …) that the format cannot hold.
+        VolumeFileError: an ending that is not written, a type or batch (N, C, …) that the format cannot hold, or
+            NIfTI-2 under another ending.
         ValueError, TypeError: a bare tensor that is no volume.
         OSError: the folder is missing or not writable.
     """
     volume = as_volume(volume)
-    path = check_saveable(path, batched=volume.batched)
-    write = format_of(path).write
-    assert write is not None
+    path = check_saveable(path, batched=volume.batched, nifti2=nifti2)
+    known = format_of(path)
+    assert known.write is not None
+    options = {"nifti2": nifti2} if known.name == "NIfTI" else {}
     with atomic_write(path) as temporary:
         try:
-            write(volume, temporary)
+            known.write(volume, temporary, **options)
         except VolumeFileError as error:  # name the file that was asked for, not the temporary one
             raise VolumeFileError(path, error.expected, error.got) from None
         if path.name.lower().endswith(".npy"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from PIL import Image
 
 from filterlab.io import FORMATS, VolumeFileError, describe, load_volume, save_volume
 from filterlab.io.tiff import natural_key
@@ -272,11 +274,69 @@ def test_without_nibabel_the_error_names_the_extra(tmp_path: Path, monkeypatch: 
         {"rowsperstrip": 2, "compression": "zlib"},
         {"tile": (16, 16)},
         {"tile": (16, 16), "compression": "zlib"},
+        {"tile": (16, 16), "compression": "zlib", "predictor": 2, "byteorder": ">", "bigtiff": True},
+        {"tile": (32, 64)},
+        {"rowsperstrip": 1, "bigtiff": True},
+        {"ome": True},
+        {"metadata": None, "description": "x" * 10**5},
+        {"imagej": True, "metadata": {"axes": "ZYX"}},
+        {"imagej": True, "metadata": {"axes": "ZYX"}, "byteorder": ">"},
+        {"shaped": True, "contiguous": True},
     ],
 )
 def test_tiff_layouts(tmp_path: Path, options: dict) -> None:
     samples = np.random.default_rng(0).integers(0, 60_000, (3, 21, 18)).astype(np.uint16)
     check(write_tiff(tmp_path / "a.tiff", samples, **options), samples, np.eye(4))
+
+
+@pytest.mark.parametrize("predictor", [1, 2, 3])
+def test_tiff_predictors_of_floats(tmp_path: Path, predictor: int) -> None:
+    """libtiff writes them (through Pillow); tifffile alone does not read predictor 3."""
+    samples = np.random.default_rng(0).normal(size=(3, 21, 18)).astype(np.float32)
+    first, *others = (Image.fromarray(plane) for plane in samples)
+    options = {"compression": "tiff_adobe_deflate", "tiffinfo": {317: predictor}}
+    first.save(tmp_path / "a.tif", save_all=True, append_images=others, **options)
+    check(tmp_path / "a.tif", samples, np.eye(4))
+
+
+@pytest.mark.parametrize("dtype", ["u1", "<u2", ">u2", "<i4", ">i4", "<f2", ">f4", "<f8", ">f8"])
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib"}, {"compression": "zlib", "predictor": 2}])
+def test_tiff_pages_equal_what_tifffile_reads(tmp_path: Path, dtype: str, options: dict) -> None:
+    samples = np.random.default_rng(0).integers(0, 256, (2, 40, 30)).astype(dtype)
+    if samples.dtype.kind == "f" and "predictor" in options:
+        return  # tifffile differences floats as numbers, everyone else as integers
+    path = write_tiff(tmp_path / "a.tif", samples, byteorder=">" if dtype[0] == ">" else "<", rowsperstrip=7, **options)
+    assert (tifffile.imread(path) == samples).all()
+    check(path, samples.astype(samples.dtype.newbyteorder("=")))
+
+
+def test_tiff_of_one_page_with_planes_behind_it(tmp_path: Path) -> None:
+    """ImageJ writes stacks beyond 4 GB like that."""
+    samples = np.random.default_rng(0).integers(0, 60_000, (5, 6, 7)).astype(np.uint16)
+    path = tmp_path / "a.tif"
+    description = "ImageJ=1.53t\nimages=5\nslices=5\nunit=um\nspacing=2.5\nloop=false\n"
+    options = {"description": description, "metadata": None, "resolution": (4.0, 2.0), "rowsperstrip": 4}
+    tifffile.imwrite(path, samples[0], byteorder=">", photometric="minisblack", **options)
+    with tifffile.TiffFile(path) as tif:
+        end = tif.pages[0].dataoffsets[-1] + tif.pages[0].databytecounts[-1]
+    assert end == path.stat().st_size  # the strips are what the file ends with
+    with path.open("ab") as file:
+        file.write(samples[1:].astype(">u2").tobytes())
+    assert check(path, samples).spacing == (0.25, 0.5, 2.5)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(VolumeFileError, match="expected 5 pages, as ImageJ says; got 1"):
+        load_volume(path)
+
+
+def test_tiff_without_lengths_of_strips(tmp_path: Path) -> None:
+    """Old writers leave them out of uncompressed files of one strip."""
+    samples = SAMPLES.astype(np.uint8)
+    for z in range(2):
+        path = write_tiff(tmp_path / f"a{z}.tif", samples[z])
+        data = path.read_bytes()
+        assert data.count(struct.pack("<H", 279)) == 1
+        path.write_bytes(data.replace(struct.pack("<H", 279), struct.pack("<H", 65001)))
+    check(tmp_path, samples)
 
 
 def test_tiff_imagej_voxel_sizes(tmp_path: Path) -> None:
@@ -374,7 +434,7 @@ def test_round_trips_are_exact(tmp_path: Path, ending: str, dtype: torch.dtype, 
     affine[:3] = rng.normal(size=(3, 4)) * [0.1, 1.0, 10.0, 1e3]
     volume = Volume((200 * torch.rand(3, 4, 5, dtype=torch.float64) - 100).to(dtype), affine=affine)
     path = tmp_path / f"a{ending}"
-    save_volume(volume, path)
+    save_volume(volume, path, nifti2=".nii" in ending)  # NIfTI-1 has an affine of float32
     found = load_volume(path)
     assert found.dtype == dtype
     assert torch.equal(found.samples, volume.samples)
@@ -397,21 +457,63 @@ def test_other_readers_agree_with_our_files(tmp_path: Path) -> None:
     assert header["space"] == "right-anterior-superior"
     assert (AFFINE[:3, :3] == header["space directions"].T).all()
     assert (header["space origin"] == AFFINE[:3, 3]).all()
-    for name, kind in (("a.nii", nibabel.Nifti1Image), ("a.nii.gz", nibabel.Nifti1Image)):
+    for name in ("a.nii", "a.nii.gz"):
         save_volume(volume, tmp_path / name)
         image = nibabel.load(tmp_path / name)
-        assert type(image) is kind  # AFFINE is exact in float32
+        assert type(image) is nibabel.Nifti1Image
         assert (volume.samples.numpy() == image.get_fdata().T).all()
         assert (image.affine == AFFINE).all()
         np.testing.assert_allclose(image.header.get_zooms(), volume.spacing)
-    save_volume(Volume(volume.samples, spacing=0.1), tmp_path / "b.nii")
-    image = nibabel.load(tmp_path / "b.nii")
-    assert isinstance(image, nibabel.Nifti2Image)  # 0.1 is not
-    assert image.affine[0, 0] == 0.1
     save_volume(volume, tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz") as archive:
         assert (archive["affine"] == AFFINE).all()
         assert (archive["samples"] == volume.samples.numpy()).all()
+
+
+@pytest.mark.parametrize("ending", [".nii", ".nii.gz"])
+def test_nifti_1_with_the_nearest_float32_affine(tmp_path: Path, ending: str, rng: np.random.Generator) -> None:
+    """What other tools open; nibabel finds every number of the affine rounded, and nothing else changed."""
+    path = tmp_path / f"a{ending}"
+    for _ in range(20):
+        affine = np.eye(4)
+        affine[:3] = rng.normal(size=(3, 4)) * [0.1, 1.0, 10.0, 1e3]
+        volume = Volume(torch.randn(3, 4, 5), affine=affine)
+        save_volume(volume, path)
+        image = nibabel.load(path)
+        assert type(image) is nibabel.Nifti1Image
+        assert (image.affine == affine.astype(np.float32)).all()
+        assert np.array_equal(image.get_fdata().T, volume.samples.numpy())
+        assert (np.abs(image.affine - affine) <= 6e-8 * np.abs(affine)).all()
+        assert (load_volume(path).affine == image.affine).all()
+        save_volume(volume, path, nifti2=True)
+        image = nibabel.load(path)
+        assert type(image) is nibabel.Nifti2Image
+        assert (image.affine == affine).all()
+    turned = np.eye(4)
+    turned[:2, :2] = [[6e-17, -0.1], [0.1, 1e-300]]  # a right angle, as cosines tell it
+    save_volume(Volume(volume.samples, affine=turned), path)
+    assert type(nibabel.load(path)) is nibabel.Nifti1Image
+
+
+@pytest.mark.parametrize("beyond", [1e39, 1e-46, 1e-40])
+def test_nifti_2_for_what_nifti_1_cannot_hold(tmp_path: Path, beyond: float) -> None:
+    save_volume(Volume(torch.zeros(1, 1, 32767, dtype=torch.uint8)), tmp_path / "a.nii")
+    assert type(nibabel.load(tmp_path / "a.nii")) is nibabel.Nifti1Image
+    long = Volume(torch.arange(32768, dtype=torch.int32)[None, None])
+    save_volume(long, tmp_path / "a.nii")
+    image = nibabel.load(tmp_path / "a.nii")
+    assert (type(image), image.shape) == (nibabel.Nifti2Image, (32768, 1, 1))
+    assert torch.equal(load_volume(tmp_path / "a.nii").samples, long.samples)
+    save_volume(Volume(torch.zeros(2, 2, 2), spacing=beyond), tmp_path / "b.nii")
+    image = nibabel.load(tmp_path / "b.nii")
+    assert type(image) is nibabel.Nifti2Image
+    assert image.affine[0, 0] == beyond
+
+
+def test_nifti_2_is_asked_of_nifti_only(tmp_path: Path) -> None:
+    with pytest.raises(VolumeFileError, match=r"a\.nrrd: expected a name that ends in \.nii or \.nii\.gz for NIfTI-2"):
+        save_volume(Volume(torch.zeros(1, 2, 2)), tmp_path / "a.nrrd", nifti2=True)
+    assert os.listdir(tmp_path) == []
 
 
 def test_nrrd_and_nifti_describe_the_same_place(tmp_path: Path) -> None:
