@@ -268,7 +268,7 @@ class GridField(Field):
 
     def _shaped(self, x: Tensor, shape: Sequence[int], *own: int) -> Tensor:
         """(N, C, M, *own) to (N, C, *P, *own), or (*P, *own) for an unbatched field."""
-        return x.reshape(*(self.channels or ()), *shape, *own)
+        return x.reshape((*(self.channels or ()), *shape, *own))
 
 
 _ROWS = (1, 3, 6)
