@@ -43,11 +43,10 @@ def check(config: Config, path: str = "") -> None:
 
 def units(config: Config) -> list[Unit]:
     """The image of the signal itself, then one per method."""
-    cost = config.view.seconds(config.resolution)
-    name = config.signal.name
+    view, n, name = config.view, config.resolution, config.signal.name
     return [
-        Unit(TRUTH, f"{name} itself", 0.5 * cost),
-        *(Unit(r.key, f"{name} {config.resolution}³, {r.key}", cost) for r in config.methods),
+        Unit(TRUTH, f"{name} itself", 0.5 * view.seconds(n, "direct")),
+        *(Unit(r.key, f"{name} {n}³, {r.key}", view.seconds(n, r.scheme)) for r in config.methods),
     ]
 
 

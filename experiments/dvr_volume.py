@@ -58,9 +58,9 @@ def check(config: Config, path: str = "") -> None:
 
 def units(config: Config) -> list[Unit]:
     """One per method and view."""
-    cost = config.view.seconds(config.volume.extent())
+    voxels, file = config.volume.extent(), config.volume.file
     return [
-        Unit(f"{recipe.key}/{name}", f"{config.volume.file}, {recipe.key}, {name}", cost)
+        Unit(f"{recipe.key}/{name}", f"{file}, {recipe.key}, {name}", config.view.seconds(voxels, recipe.scheme))
         for recipe in config.methods
         for name in config.windows
     ]

@@ -129,7 +129,7 @@ def units(config: Config) -> list[Unit]:
         seconds = 0.5 + config.points * 1e-4
         work += [Unit(f"{i}/points/{r.key}", f"{source.title}, {r.key}", seconds) for r in config.methods]
         if source.view is not None:
-            seconds = 2 * source.view.seconds(source.extent())
+            seconds = 2 * source.view.seconds(source.extent(), "eight_trilinear")
             work += [
                 Unit(f"{i}/image/{r.key}", f"{source.title}, {r.key}: images", seconds) for r in config.image_methods
             ]

@@ -16,7 +16,11 @@ from filterlab.render import scene
 from filterlab.render.dvr import render
 from filterlab.render.rays import intersect, segment_count
 
-SECONDS_PER_SAMPLE = 3e-7  # of plain torch on two cores, for views that are mostly empty; only expectations use it
+SECONDS_PER_SAMPLE = {"fused": 1e-8, "plain": 3e-7}
+"""Of the marchers, on one core and on two, for views that are mostly empty; only expectations use it.
+
+`python -m benchmarks dvr` measures 5 to 7 ns a sample of the fused marcher.
+"""
 MAX_SAMPLES = 2**34  # of an image: hours of work
 SSIM_WINDOW = 11  # pixels
 _PROBE = 96  # pixels along the longer side, by which the samples of an image are estimated
@@ -110,10 +114,15 @@ class View(StrictModel):
         count = segment_count((far - near).clamp_min(0), self.step * domain.voxel_size).sum()
         return float(count) * (self.size[0] * self.size[1]) / (width * height)
 
-    def seconds(self, voxels: float) -> float:
-        """A rough expectation for an image of a volume with that many voxels along an axis."""
+    def seconds(self, voxels: float, scheme: str | None) -> float:
+        """A rough expectation for an image of a volume with that many voxels along an axis.
+
+        Args:
+            scheme: of the field; None: the default, which is fused where it can run.
+        """
         width, height = self.size
-        return width * height * voxels / self.step * SECONDS_PER_SAMPLE + 0.2
+        marcher = "fused" if scheme in (None, "fused") else "plain"
+        return width * height * voxels / self.step * SECONDS_PER_SAMPLE[marcher] + 0.2
 
     def draw(self, field: fl.Field, run: Progress, device: str, dtype: Dtype) -> Tensor:
         """The image of a field over the background, linear RGB `(H, W, 3)`, float32, on the CPU."""

@@ -6,6 +6,7 @@ import math
 import re
 import struct
 from copy import deepcopy
+from pathlib import Path
 
 import nibabel
 import numpy as np
@@ -164,6 +165,8 @@ def tiny(name, scan):
     configs["stability"] = {"methods": ["trilinear"], "cases": ["nan-coordinate"], "amount": 0.02}
     parts = {n: {"experiment": n, "description": f"tiny {n}", **c} for n, c in configs.items()}
     parts["demo"] = {"experiment": "demo", "description": "tiny", "sections": [parts["rms_error"], parts["dvr_volume"]]}
+    if name not in parts:
+        pytest.fail(f"the experiment {name} has no tiny config: add one to `tiny` in {Path(__file__).name}")
     return parts[name]
 
 
