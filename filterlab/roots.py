@@ -403,7 +403,7 @@ def _halves(parts: _Parts, h: float) -> _Parts:
 def _searched(rows: Rows, crossings: _Brackets, valleys: _Brackets) -> Tensor:
     """t (B,) from all parts that hold a root, and those that may hold one because p has a valley there."""
     tolerance = _tolerance(len(rows) - 1, rows[0].dtype)
-    touches, more = _bottoms(rows, valleys, tolerance)
+    touches, more = _bottoms(rows, valleys, 1.5 * tolerance)  # a bottom is found to the rounding of p′
     brackets = _Brackets.joined((crossings, more))
     first = torch.full_like(rows[0], inf)
     for found in (brackets, touches):
@@ -423,7 +423,8 @@ def _bottoms(rows: Rows, valleys: _Brackets, tolerance: float) -> tuple[_Bracket
     own = _chosen(rows, valleys.owner)
     falling = [left - right for left, right in pairwise(own)]
     chart = _chart(valleys.a, valleys.b, _positive(falling, 0.0))
-    bottom = _newton(chart.turned(chart.rows(falling)), chart.low, chart.high)
+    middle = 0.5 * (chart.low + chart.high)  # the chord may begin beyond a hill that rounding hides near an end
+    bottom = _newton(chart.turned(chart.rows(falling)), chart.low, chart.high, middle)
     here = chart.rows(own)
     value, size = (chart.back(_horner(r, bottom)[0]) for r in (here, [r.abs() for r in here]))
     cut = valleys._replace(b=chart.t(bottom))
@@ -530,17 +531,17 @@ def _polished(rows: Rows, u: Tensor) -> Tensor:
     return torch.where(good, new, u)
 
 
-def _newton(rows: Rows, low: Tensor, high: Tensor) -> Tensor:
+def _newton(rows: Rows, low: Tensor, high: Tensor, start: Tensor | None = None) -> Tensor:
     """u (N,) in [low, high] where Σ_i rows[i] u^i, positive at `low` and not at `high`, vanishes.
 
-    Starts where the chord between the ends does. A step that leaves the bracket, or is not half as long as the one
-    before, is replaced by bisection. Who has arrived stays where it is, so that nobody's digits depend on the company:
-    after a step of no more than 2 ε u or, later on, where the polynomial is 0 within its rounding and falls.
-    Where that hides its sign, it has the sign of the nearer end: it may vanish at an end as well.
+    Starts at `start`, or where the chord between the ends vanishes. A step that leaves the bracket, or is not half as
+    long as the one before, is replaced by bisection. Who has arrived stays where it is, so that nobody's digits depend
+    on the company: after a step of no more than 2 ε u or, later on, where the polynomial is 0 within its rounding and
+    falls. Where that hides its sign, it has the sign of the nearer end: it may vanish at an end as well.
     """
     eps, low = torch.finfo(low.dtype).eps, low.clamp_min(torch.finfo(low.dtype).tiny)
     sizes, centre = [r.abs() for r in rows], 0.5 * (low + high)
-    u = _chord(rows, low, high)
+    u = _chord(rows, low, high) if start is None else start
     result, last, active = u.clone(), high - low, torch.ones_like(low, dtype=torch.bool)
     index = torch.arange(len(u), device=u.device)
     for k in range(_PASSES):
