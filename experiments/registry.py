@@ -30,6 +30,7 @@ _NAMES = (
     "fit_kernel",
     "recommend_validation",
     "stability",
+    "root_finding",
     "demo",
 )
 

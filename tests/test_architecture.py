@@ -21,6 +21,8 @@ FLOORS = {
     "forking": 0,
     "volume": 0,
     "kernels": 0,
+    "bernstein": 0,
+    "roots": 0,
     "prefilters": 1,
     "ops": 2,
     "fields": 3,
@@ -141,7 +143,7 @@ def test_the_library_imports_neither_experiments_nor_tests(path):
 
 
 def test_the_floors_say_what_the_drawing_says():
-    """kernels, volume → prefilters → ops → fields → methods → render."""
+    """kernels, volume, bernstein, roots → prefilters → ops → fields → methods → render."""
     flow = [FLOORS[name] for name in ("kernels", "prefilters", "ops", "fields", "methods", "render")]
     assert flow == sorted(set(flow))
 

@@ -163,6 +163,15 @@ def tiny(name, scan):
         "seconds": 0.01,
     }
     configs["stability"] = {"methods": ["trilinear"], "cases": ["nan-coordinate"], "amount": 0.02}
+    configs["root_finding"] = {
+        "families": ["random", "double", "root-at-end"],
+        "degrees": [4, 5],
+        "dtypes": ["float32"],
+        "count": 40,
+        "kornia": 5,
+        "exact": 5,
+        "chunk": 25,
+    }
     parts = {n: {"experiment": n, "description": f"tiny {n}", **c} for n, c in configs.items()}
     parts["demo"] = {"experiment": "demo", "description": "tiny", "sections": [parts["rms_error"], parts["dvr_volume"]]}
     if name not in parts:
