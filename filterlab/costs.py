@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Field
-from filterlab.ops.differentiable.recording import differentiating
 
 Clock = Callable[[], float]
 Tick = Callable[[float], None]
@@ -136,7 +135,7 @@ def measure(
     for name, p in where.items():
         if p.numel() == 0:
             raise ValueError(f"expected points (P, 3) with P ≥ 1 to sample {name} at; got shape {tuple(p.shape)}")
-    with differentiating(False):
+    with torch.no_grad():
         builds = {name: _finished(build, where[name].device) for name, build in candidates.items()}
         fields = {name: build() for name, build in builds.items()}
         jets = {name: _finished(_jet(f, where[name], order), where[name].device) for name, f in fields.items()}

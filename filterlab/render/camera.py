@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Domain
-from filterlab.ops.differentiable.recording import differentiating
 
 Vector = Sequence[float] | Tensor
 Window = tuple[float, float, float, float]
@@ -52,8 +51,7 @@ class Camera(ABC):
         for name in ("position", "target", "up"):
             _check_vector(name, getattr(self, name))
         check_window(self.window)
-        with differentiating(False):
-            _basis(*(_vector(v).cpu() for v in (self.position, self.target, self.up)))
+        _basis(*(_vector(v).detach().cpu() for v in (self.position, self.target, self.up)))
 
     @property
     def requires_grad(self) -> bool:

@@ -24,7 +24,6 @@ from torch.utils.checkpoint import checkpoint
 
 from filterlab.fields.base import Domain, Field
 from filterlab.fields.grid import GridField
-from filterlab.ops.differentiable.recording import differentiating
 from filterlab.ops.march import Chords
 from filterlab.ops.reference.march import rays_at_once
 from filterlab.ops.reference.optics import absorbed
@@ -173,13 +172,12 @@ def prepare(
     asked = float(step) * field.domain.voxel_size
     length = lengths["the step"]
     media = [Medium(one, transfer, shading, length, faint, differentiable) for one in _unbatched(field)]
-    cut = _Cut(field.domain, box, length, asked / length, jitter_seed, differentiable)
+    cut = _Cut(field.domain, box, length, asked / length, jitter_seed, differentiable and view.requires_grad)
     marcher, at_once = _marcher(media[0], memory)
-    with differentiating(differentiable):
-        parts = [_Part(range(i, min(i + at_once, view.count))) for i in range(0, view.count, at_once)]
-        if view.count * _BYTES_PER_RAY <= memory:  # else rays are cut again for every image
-            parts = [replace(part, chords=cut(view, view.pixels(part.order))) for part in parts]
-        total = cut.count_all(view, parts, len(media), max_samples)
+    parts = [_Part(range(i, min(i + at_once, view.count))) for i in range(0, view.count, at_once)]
+    if view.count * _BYTES_PER_RAY <= memory:  # else rays are cut again for every image
+        parts = [replace(part, chords=cut(view, view.pixels(part.order))) for part in parts]
+    total = cut.count_all(view, parts, len(media), max_samples)
     return Job(media, marcher, view, cut, parts, total, color, field.channels)
 
 
@@ -233,10 +231,7 @@ class Job:
 
     def run(self, progress: Progress = False) -> Tensor:
         """The image, as `render` gives it."""
-        with (
-            differentiating(self.media[0].differentiable),
-            _reporting(progress, self.samples) as report,
-        ):
+        with _reporting(progress, self.samples) as report:
             images = self._images(report)
             report(self.samples)
         return images.reshape(*(self._channels or ()), *self._view.shape, 4)
@@ -381,7 +376,6 @@ class _Cut:
             return torch.ones_like(pixels, dtype=torch.float64)
         return (self.stretch * jitter(self.jitter_seed, pixels)).clamp_max(1)
 
-    @differentiating(False)
     def count_all(self, view: _View, parts: Sequence[_Part], images: int, limit: int) -> int:
         """How many samples the images take. Raises ValueError above `limit`."""
         total = 0.0

@@ -16,7 +16,6 @@ import torch
 from filterlab.costs import Quartiles, coefficient_bytes
 from filterlab.fields.grid import GridField
 from filterlab.methods import METHODS
-from filterlab.ops.differentiable.recording import differentiating
 from filterlab.ops.march import Chords
 from filterlab.ops.reference.march import segments
 from filterlab.render.dvr import Job, prepare
@@ -85,11 +84,10 @@ def plan(prepared: Prepared) -> Plan:
 
     Takes as long as a few thousand rays do, five times over.
     """
-    with differentiating(False):
-        job = prepare(prepared.field, prepared.camera, prepared.transfer, **prepared.options)
-        medium, some = job.media[0], _some_rays(job)
-        seconds = _seconds(job, medium, some)
-        empty, skipped = _skipped(job, medium, some)
+    job = prepare(prepared.field, prepared.camera, prepared.transfer, **prepared.options)
+    medium, some = job.media[0], _some_rays(job)
+    seconds = _seconds(job, medium, some)
+    empty, skipped = _skipped(job, medium, some)
     field = prepared.field
     known = isinstance(field, GridField)
     return Plan(

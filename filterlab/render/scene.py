@@ -31,7 +31,6 @@ from filterlab.io.config import StrictModel, load_config, unknown_name
 from filterlab.io.volumes import describe, load_volume
 from filterlab.methods import METHODS, reconstruct
 from filterlab.missing_values import NanChoice
-from filterlab.ops.differentiable.recording import differentiating
 from filterlab.recommendation import recommend, report
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
 from filterlab.render.dvr import Progress, render
@@ -512,8 +511,7 @@ def render_scene(scene: Scene, progress: Progress = False) -> Tensor:
 
     For its opacity as well: `build(scene).render()`.
     """
-    with differentiating(False):
-        return build(scene).render(progress)[..., :3]
+    return build(scene).render(progress)[..., :3]
 
 
 def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]]:

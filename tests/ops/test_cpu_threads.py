@@ -11,13 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import filterlab
 from filterlab import forking
 from filterlab.ops.cpu import threads
 from filterlab.ops.cpu.job import Job
-from filterlab.ops.differentiable.recording import differentiating
 
 
 class Counting(Job):
@@ -134,26 +132,18 @@ def test_addresses_are_only_taken_where_the_arrays_are_held() -> None:
     assert found <= {"job.py", "threads.py", "prefilter.py"}  # the last one asks how memory is aligned
 
 
-# --- what must be put back --------------------------------------------------------------------------------------------
+# --- what must be left alone ------------------------------------------------------------------------------------------
 
 
-def test_the_grad_mode_is_put_back_though_a_block_was_never_entered() -> None:
-    """As when Ctrl-C comes behind the first line of a context manager."""
-
-    def interrupted() -> None:
-        differentiating(False).__enter__()
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert torch.is_grad_enabled()
-    kept = []
-    with differentiating(False):
-        kept.append(differentiating(False))
-        kept[0].__enter__()
-    assert torch.is_grad_enabled()
-    kept.clear()  # it ends late, and must not put back what was around it
-    assert torch.is_grad_enabled()
+def test_the_grad_mode_is_never_switched_where_ctrl_c_could_leave_it() -> None:
+    """Ctrl-C between the lines of `torch.no_grad` leaves it off for good: within a backward pass torch puts it back."""
+    package = Path(filterlab.__file__).parent
+    switching = re.compile(r"no_grad\(|set_grad_enabled\(|enable_grad\(|inference_mode\(")
+    found = {str(p.relative_to(package)): switching.findall(p.read_text(encoding="utf-8")) for p in package.rglob("*.py")}
+    assert {name: calls for name, calls in found.items() if calls} == {
+        "ops/differentiable/march.py": ["enable_grad("],  # within the backward pass
+        "costs.py": ["no_grad("],  # which measures for seconds, and is told so
+    }
 
 
 # --- forks ------------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from torch import Tensor
 from filterlab import forking
 from filterlab.ops import cpu, cuda
 from filterlab.ops.differentiable.gather import gather
-from filterlab.ops.differentiable.recording import differentiating, transforming
+from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.march import MAX_LIGHTS, Bricks, March
 from filterlab.ops.march_derivatives import GRADIENTS, MEMBERS
 from filterlab.ops.reference import march as reference
@@ -69,13 +69,11 @@ def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dty
     return room.missing(coefficients.detach()[None, None], points, stencil, None, start)
 
 
-@differentiating(False)
 def run(given: March, report: Report = lambda rays: None, implementation: str | None = None) -> tuple[Tensor, Tensor]:
     """Light (R, 3) and optical depth (R,), float64, without derivatives; by default on the device of the tensors."""
     return _loaded(implementation or implementation_for(given.coefficients)).march(given, report)
 
 
-@differentiating(False)
 def adjoint(
     given: March,
     light: Tensor,
@@ -161,7 +159,7 @@ def _by_the_adjoint(
     asked: _Asked, tensors: Sequence[Tensor], needed: Sequence[bool], light: Tensor, cotangents: Sequence[Tensor]
 ) -> list[Tensor | None]:
     """By the fused adjoint, and from what was prepared for it back to the tensors by autograd."""
-    with differentiating(True):
+    with torch.enable_grad():  # within a backward pass, which puts the mode back whatever is raised
         leaves = [t.detach().requires_grad_(need) for t, need in zip(tensors, needed, strict=True)]
         given = asked.prepared(leaves)
     named = given.tensors

@@ -1,10 +1,10 @@
-"""Whether anything has to be recorded for derivatives."""
+"""Whether anything has to be recorded for derivatives.
+
+What is asked is looked up, never switched: torch's grad mode is left as it is, since Ctrl-C between the lines of
+`torch.no_grad` would leave it off for good. Where nothing requires a gradient, nothing is recorded in any mode.
+"""
 
 from __future__ import annotations
-
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -24,24 +24,3 @@ def transformed() -> bool:
 def transforming() -> bool:
     """The same but for torch.compile."""
     return torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
-
-
-_modes = threading.local()  # in its list, one mark for everybody who has changed the grad mode
-
-
-@contextmanager
-def differentiating(on: bool) -> Iterator[None]:
-    """torch's grad mode, put back in any case.
-
-    `torch.no_grad` leaves it off for good when Ctrl-C comes between its first line and the block. This generator, left
-    behind there, is closed with the exception; and whoever is around it has put the mode back by then, marks included.
-    """
-    before, mark, marks = torch.is_grad_enabled(), object(), _modes.__dict__.setdefault("marks", [])
-    try:
-        marks.append(mark)
-        torch._C._set_grad_enabled(on)
-        yield
-    finally:
-        if mark in marks:
-            torch._C._set_grad_enabled(before)
-            del marks[marks.index(mark) :]
