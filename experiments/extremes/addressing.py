@@ -10,7 +10,6 @@ from __future__ import annotations
 import ctypes
 import mmap
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -27,6 +26,7 @@ from filterlab.fields.grid import GridField
 from filterlab.kernels import bspline
 from filterlab.ops import Stencil, gather
 from filterlab.ops.cpu.gather import Program, scatter
+from filterlab.ops.cpu.job import Function
 from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.cpu.points import BLOCK
 from filterlab.render import TransferFunction, render
@@ -149,14 +149,14 @@ def many_points(_subject: Subject, random: np.random.Generator, amount: float) -
     return tally.finding()
 
 
-def _run_the_last(function: Callable[[int], object], job: Any, count: int) -> None:
+def _run_the_last(function: Function, job: Any, count: int) -> None:
     """Only the chunks that hold the last `count` points, on this thread."""
     lanes = lanes_of(torch.float32)
     packs = -(-job.count // lanes)
     job.chunk = BLOCK
     job.chunks = -(-packs // BLOCK)
     job.next = job.chunks - count // (lanes * BLOCK) - 2
-    function(ctypes.addressof(job))
+    function(ctypes.addressof(job), 0, job.chunks)
 
 
 def many_segments(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
