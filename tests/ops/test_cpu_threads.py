@@ -141,8 +141,6 @@ def test_the_grad_mode_is_never_switched_where_ctrl_c_could_leave_it() -> None:
     switching = re.compile(r"no_grad\(|set_grad_enabled\(|enable_grad\(|inference_mode\(")
     texts = {str(p.relative_to(package)): p.read_text(encoding="utf-8") for p in package.rglob("*.py")}
     found = {name: switching.findall(text) for name, text in texts.items()}
-        str(p.relative_to(package)): switching.findall(p.read_text(encoding="utf-8")) for p in package.rglob("*.py")
-    }
     assert {name: calls for name, calls in found.items() if calls} == {
         "ops/differentiable/march.py": ["enable_grad("],  # within the backward pass
         "costs.py": ["no_grad("],  # which measures for seconds, and is told so
