@@ -44,7 +44,7 @@ HALVES = ("tuning", "reporting")
 
 _BUDGETS = 1e-4, 0.1
 _AROUND = 4.0  # times the true errors
-_COUNTS, _HELD = 0.05, 0.95  # see `filterlab.recommendation.calibration`
+_COUNTS, _HELD = 0.05, 0.97  # see `filterlab.recommendation.calibration`
 _COSTS_ON = 64  # voxels along an axis
 
 

@@ -24,13 +24,23 @@ LEAD = (
     "justified if nothing that was considered meets it.",
     "Factors were fitted to the tuning half. What counts is the reporting half.",
 )
-BARS = {"holds": 0.95, "kept": 0.98, "justified": 0.90, "near": 0.80}
+BARS = {"holds": 0.95, "kept": 0.98, "justified": 0.90, "hard": None, "sure": None, "near": 0.80}
 WORDS = {
     "holds": "the interval holds the true error",
     "kept": "the pick keeps the budget",
-    "justified": "nothing was picked, and nothing meets the budget",
+    "justified": "nothing was picked, and nothing meets the budget: budgets as people ask",
+    "hard": "the same: budgets near the true errors",
+    "sure": "the same: no interval holds the budget (not undecided)",
     "near": f"the pick costs at most {FACTOR} × the cheapest that meets the budget",
 }
+TITLES = (
+    "interval holds",
+    "budget kept",
+    "refusal justified",
+    "near true errors",
+    "not undecided",
+    f"cost ≤ {FACTOR} ×",
+)
 
 Outcomes = Mapping[str, list[bool]]
 
@@ -68,7 +78,9 @@ def outcomes(record: Record, found: Mapping[str, Any], task: str | None = None) 
             if task in (None, name) and None not in (*way[name], _counted(way, name))  # infinite: no interval
         ],
         "kept": [a["kept"] for a in answers if a["picked"]],
-        "justified": [a["justified"] for a in answers if not a["picked"]],
+        "justified": [a["justified"] for a in answers if not a["picked"] and not a["near"]],
+        "hard": [a["justified"] for a in answers if not a["picked"] and a["near"]],
+        "sure": [a["justified"] for a in answers if not a["picked"] and not a["undecided"]],
         "near": [a["factor"] <= FACTOR for a in answers if a["picked"] and a["factor"] is not None],
     }
 
@@ -104,7 +116,12 @@ def _verdict(volumes: Sequence[Record]) -> Table:
     halves = {half: [r for r in volumes if r["half"] == half] for half in HALVES}
     known = {half: _of(of_half) for half, of_half in halves.items()}
     rows = [
-        [WORDS[name], f"≥ {100 * bar:.0f} %", *(_rate(known[half][name]) for half in HALVES), _met(known, name)]
+        [
+            WORDS[name],
+            MISSING if bar is None else f"≥ {100 * bar:.0f} %",
+            *(_rate(known[half][name]) for half in HALVES),
+            _met(known, name),
+        ]
         for name, bar in BARS.items()
     ]
     numbers = " and ".join(f"{len(of_half)} ({half})" for half, of_half in halves.items())
@@ -112,14 +129,13 @@ def _verdict(volumes: Sequence[Record]) -> Table:
 
 
 def _met(known: Mapping[str, Outcomes], name: str) -> str:
-    held = known[HALVES[1]][name]
-    return ("met" if sum(held) >= BARS[name] * len(held) else "MISSED") if held else ""
+    held, bar = known[HALVES[1]][name], BARS[name]
+    return "" if bar is None or not held else "met" if sum(held) >= bar * len(held) else "MISSED"
 
 
 def _groups(volumes: Sequence[Record], caption: str, key: Callable[[Record, Any], str] | None) -> Table:
     """Rates in groups of volumes and boundaries; by task without a key."""
-    columns = [Column("", numeric=False), *(Column(w) for w in ("interval holds", "budget kept", "refusal justified"))]
-    columns.append(Column(f"cost ≤ {FACTOR} ×"))
+    columns = [Column("", numeric=False), *(Column(title) for title in TITLES)]
     pairs = [(record, found) for record in volumes for found in record["boundaries"]]
     if key is None:
         groups = {t: [outcomes(r, f, t) for r, f in pairs] for t in ("resample", "isosurface", "dvr")}
@@ -187,8 +203,8 @@ def _calibration(volumes: Sequence[Record]) -> Table:
             rows.append([f"{letter} of the {quantity}, in use", *(fixed(factor) for factor in used[i])])
             rows.append(["fitted to the tuning half", *(fixed(factor) for factor in found[quantity][i])])
     caption = (
-        "Factors of the doubt at each fall of the spectrum: quantiles of those with which the interval of a method would "
-        "just have held."
+        "Factors of the doubt at each fall of the spectrum: quantiles of those with which the interval of a method "
+        "would just have held."
     )
     return Table(columns, rows, caption)
 

@@ -5,10 +5,11 @@ error t is set against the distance d that was measured from the estimate: c and
 
     d − c u ≤ t ≤ √(d² + (C u)²)
 
-fails below and above in one of twenty cases each, where u counts at all (u > d / 20). They are quantiles over methods,
-boundaries and volumes of known truth near each φ: those of the tuning half of the experiment `recommend_validation`,
-whose report shows them anew, and how often they held on the other half. Where the spectrum falls steeply, the estimate
-is off by about u; where it does not fall, as with steps, noise and fractals, by several times u.
+fails below and above in three of a hundred cases each, where u counts at all (u > d / 20). They are quantiles over
+methods, boundaries and volumes of known truth near each φ: those of the tuning half of the experiment
+`recommend_validation`, whose report shows them anew, and how often they held on the other half. Where the spectrum
+falls steeply, the estimate is off by about u; where it does not fall, as with steps, noise and fractals, by several
+times u.
 """
 
 from __future__ import annotations
@@ -22,9 +23,18 @@ FALLS = (0.0, 1.0, 2.0, 4.0, 8.0, 14.0, 24.0, 40.0)
 """φ at which factors are known; in between they are linear, beyond constant."""
 
 CALIBRATION: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
-    "value": ((1.0, 0.7, 0.5, 0.8, 1.7, 1.5, 1.0, 0.8), (5.6, 5.7, 5.2, 4.0, 2.3, 1.7, 1.3, 0.9)),
-    "gradient": ((1.0, 0.7, 0.5, 0.8, 1.7, 1.5, 1.0, 0.8), (5.6, 7.0, 5.6, 5.0, 2.6, 1.6, 1.2, 0.9)),
-    "bend": ((2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.5, 1.5), (15.0, 15.0, 8.0, 6.0, 3.0, 2.5, 2.5, 2.0)),
+    "value": (
+        (1.07, 0.98, 0.31, 1.12, 1.05, 0.93, 0.93, 0.87),
+        (5.75, 5.72, 5.54, 4.00, 3.25, 1.49, 0.84, 0.78),
+    ),
+    "gradient": (
+        (0.88, 0.86, 0.32, 1.20, 1.15, 0.88, 0.81, 0.72),
+        (7.84, 9.93, 9.97, 6.17, 3.83, 1.44, 0.90, 0.53),
+    ),
+    "bend": (
+        (3.95, 3.61, 0.14, 0.61, 0.65, 0.56, 0.36, 0.13),
+        (13.23, 18.61, 19.64, 11.06, 6.84, 2.48, 2.41, 1.87),
+    ),
 }
 """Of values, gradients and second derivatives along lines: c and C at each of `FALLS`."""
 
