@@ -15,9 +15,10 @@ from filterlab import costs
 from filterlab.cli import MEMORY, TIME, UsageError, main, quantity
 from filterlab.io.config import loads_config
 from filterlab.recommendation import ErrorEstimate, Recommendation, recommend, report, ways
-from filterlab.recommendation.choice import IMAGE, _marched
-from filterlab.recommendation.errors import Distance
+from filterlab.recommendation.choice import IMAGE, Question, _marched, choose
+from filterlab.recommendation.errors import Distance, Yardstick
 from filterlab.recommendation.survey import inner_box
+from filterlab.recommendation.ways import WayCost
 from filterlab.render.scene import Scene
 from filterlab.signals import Signal
 
@@ -195,6 +196,19 @@ def test_a_pick_is_built_of_all_of_the_volume() -> None:
     assert answer.pick is not None
     assert answer.pick.storage in ("int16", "uint8")
     answer.field(volume)
+
+
+def test_what_only_the_whole_volume_tells_is_found_before_it_is_picked() -> None:
+    """As if the parts that were looked at had fitted into float16."""
+    volume = fl.Volume(1e6 * torch.rand(8, 8, 8))
+    yardstick = Yardstick.of(volume.samples[None], None, fl.Boundary.MIRROR)
+    plain, short = ("trilinear", "fused", None), ("trilinear", "fused", "float16")
+    errors = dict.fromkeys((plain, short), yardstick.errors("trilinear"))
+    question = Question("resample", 9.0, math.inf, math.inf, "mirror", "refuse")
+    found = choose(question, volume, yardstick, errors, {plain: WayCost(1.0, 9.0, 8), short: WayCost(0.1, 1.0, 4)})
+    assert [c.storage for c in found.candidates] == ["float16", None]
+    assert found.pick is not None
+    assert found.pick.storage is None
 
 
 def test_no_integer_is_nan(samples) -> None:
