@@ -1,202 +1,316 @@
-"""Does `filterlab recommend` keep its word? Volumes whose truth is known, several budgets each.
+"""Does `filterlab recommend` keep its word? Volumes of wide variety whose truth is known (`variety`), in two halves.
 
-A case is a volume, a task and a budget. Of every way to reconstruct it that was considered (method, scheme, storage),
-the true error is computed from the truth at random points of the inner 0.9 of the box, and set against
+On every volume, under some of the boundaries, for every method and storage, what `recommend` estimates is set
+against the true error over the region that is promised; and for every task and some budgets, what it answers is judged:
 
-    the budget              the pick's true error must not exceed it
-    the cheapest way        that truly meets the budget; the pick must not cost more than 1.5 times as much
+    an interval     must hold the true error
+    a pick          its true error must not exceed the budget, nor its cost 1.5 × that of the cheapest that meets it
+    a refusal       nothing that was considered may truly meet the budget
 
-Costs are those that `recommend` measured; what is judged is the choice. Scans have no closed form: a low-passed scan is
-taken as truth, and every second voxel of it as the volume (`members.Scan`).
+Budgets are drawn log-uniform, half of them between 0.01 % and 10 %, as people ask; the other half from a quarter of the
+least true error to four times the largest, where answers are hardest. Costs are measured once, on one volume, and
+carried over: what is judged is the choice.
+
+Volumes of even number are for tuning: `recommend`'s `CALIBRATION` is fitted to them (`fitted`). The others report.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
-from pydantic import Field
-from torch import Tensor
+from pydantic import Field, model_validator
 
 import filterlab as fl
-from experiments.config import ExperimentConfig, SignalChoice, VolumeChoice, number
-from experiments.members import Sampling, Scan, WavesClass
-from experiments.rms_error import evaluate, uniform_points
+from experiments.config import ExperimentConfig, VolumeChoice, number
+from experiments.members import seed_of
 from experiments.runs import Record, Run, Unit
-from filterlab import metrics
-from filterlab.io.config import StrictModel
-from filterlab.prediction import INNER
-from filterlab.recommendation import Candidate, Recommendation, recommend
+from experiments.variety import CLASSES, Subject, of_class, of_scan, size_of
+from filterlab.methods import METHODS
+from filterlab.recommendation.calibration import CALIBRATION, FALLS
+from filterlab.recommendation.choice import TASKS, Candidate, Question, Recommendation, choose, errors_of
+from filterlab.recommendation.errors import SURE, MethodErrors, Yardstick
+from filterlab.recommendation.ways import Way, WayCost, costs_of, ways_of
+from filterlab.volume import Boundary, as_volume
 
-Share = Annotated[float, Field(gt=0, le=1)]
 Size = Annotated[int, Field(ge=2, le=160)]
 FACTOR = 1.5  # of the cheapest that truly meets the budget
+HALVES = ("tuning", "reporting")
 
-
-class SampledSignal(StrictModel):
-    """A signal at several resolutions, a volume each."""
-
-    signal: SignalChoice
-    resolutions: Annotated[list[Size], Field(min_length=1)]
-
-
-class Waves(StrictModel):
-    """Band-limited random fields (`members.WavesClass`), one of each bandwidth, in parts of the Nyquist frequency."""
-
-    bandwidths: Annotated[list[Share], Field(min_length=1)]
-    resolution: Size
+_BUDGETS = 1e-4, 0.1
+_AROUND = 4.0  # times the true errors
+_COUNTS, _HELD = 0.05, 0.97  # see `filterlab.recommendation.calibration`
+_COSTS_ON = 64  # voxels along an axis
 
 
 class Config(ExperimentConfig):
-    """Which volumes, tasks and budgets.
+    """Which volumes, boundaries and budgets.
 
     Attributes:
-        signals, waves, scans: where volumes come from.
-        tasks, budgets: every one for every volume; budgets in parts of the value range.
+        classes: of `variety`; each: volumes of every one.
+        sizes: voxels along an axis, least and most, log-uniform; large: those of one volume in `every`.
+        scans, pieces: files, and pieces of every one; one in three is not low-passed before it is decimated.
+        boundaries, budgets: how many of the five are drawn for a volume, and of budgets for each task.
         points: at which errors are computed.
-        seconds: that costs are measured for, in each case.
+        seconds: for which costs are measured, once.
     """
 
     experiment: Literal["recommend_validation"]
-    signals: Annotated[list[SampledSignal], Field(default_factory=list)]
-    waves: Annotated[list[Waves], Field(default_factory=list)]
+    classes: Annotated[list[str], Field(min_length=1)]
+    each: Annotated[int, Field(ge=1, le=1000)]
+    sizes: tuple[Size, Size] = (8, 64)
+    large: tuple[Size, Size] = (96, 160)
+    every: Annotated[int, Field(ge=2)] = 15
     scans: Annotated[list[VolumeChoice], Field(default_factory=list)]
-    tasks: Annotated[list[Literal["resample", "isosurface"]], Field(min_length=1)]
-    budgets: Annotated[list[Share], Field(min_length=1)]
-    points: Annotated[int, Field(ge=100, le=10**6)] = 4000
-    seconds: Annotated[float, Field(gt=0, le=60)] = 0.3
+    pieces: Annotated[int, Field(ge=1, le=100)] = 6
+    boundaries: Annotated[int, Field(ge=1, le=5)] = 2
+    budgets: Annotated[int, Field(ge=2, le=20, multiple_of=2)] = 4
+    points: Annotated[int, Field(ge=100, le=10**6)] = 2**14
+    seconds: Annotated[float, Field(gt=0, le=600)] = 20.0
 
-
-@dataclass(frozen=True)
-class _Subject:
-    """A volume and its truth.
-
-    Attributes:
-        volume: samples on the integers.
-        points: (P, 3), voxel coordinates.
-        value, gradient: the truth there, the gradient per voxel.
-    """
-
-    volume: Tensor
-    points: Tensor
-    value: Tensor
-    gradient: Tensor
-
-
-def _subjects(config: Config) -> dict[str, Callable[[], _Subject]]:
-    """Names of volumes -> how to make them."""
-    made: dict[str, Callable[[], _Subject]] = {}
-    for choice in config.signals:
-        for n in choice.resolutions:
-            made[f"{choice.signal.label}, {n}³"] = lambda c=choice, n=n: _of_signal(c.signal.build(), n, config)
-    for waves in config.waves:
-        for bandwidth in waves.bandwidths:
-            label = f"waves to {bandwidth:g} of Nyquist, {waves.resolution}³"
-            made[label] = lambda b=bandwidth, n=waves.resolution: _of_signal(_waves(b, n, config.seed), n, config)
-    for scan in (scan for scan in config.scans if scan.present):
-        made[f"scan {scan.file}"] = lambda s=scan: _of_scan(s, config)
-    return made
-
-
-def _waves(bandwidth: float, n: int, seed: int) -> fl.signals.Signal:
-    drawn = WavesClass(kind="waves", title="waves", bandwidth=bandwidth)
-    return drawn.draw(torch.Generator().manual_seed(seed), n)
-
-
-def _of_signal(signal: fl.signals.Signal, n: int, config: Config) -> _Subject:
-    volume = signal.sample(n, dtype=torch.float64)
-    points = uniform_points(signal, config.points, INNER, config.seed, torch.float64, "cpu")
-    value, gradient = evaluate(signal, points)
-    return _Subject(volume.samples.float(), volume.world_to_voxel(points), value, gradient * volume.spacing[0])
-
-
-def _of_scan(scan: VolumeChoice, config: Config) -> _Subject:
-    known = Scan.of(scan.load().samples.double(), Sampling(resolution=32, inner=INNER))
-    size = torch.tensor(known.coarse.shape[::-1], dtype=torch.float64)
-    unit = torch.rand(config.points, 3, generator=torch.Generator().manual_seed(config.seed), dtype=torch.float64)
-    points = size * (0.5 + INNER * (unit - 0.5)) - 0.5
-    value, gradient = evaluate(known.truth, 2 * points)
-    return _Subject(known.coarse.float(), points, value, 2 * gradient)
+    @model_validator(mode="after")
+    def _known(self) -> Config:
+        if unknown := [name for name in self.classes if name not in CLASSES]:
+            raise ValueError(f"expected classes of {', '.join(CLASSES)}; got {', '.join(unknown)}")
+        return self
 
 
 def check(config: Config, path: str = "") -> None:
-    """Raises ConfigError unless the signals can be evaluated and the scans, but for optional ones, are here."""
-    for i, choice in enumerate(config.signals):
-        choice.signal.check(f"{path}signals[{i}].signal")
+    """Raises ConfigError unless the scans, but for optional ones, are here."""
     for i, scan in enumerate(config.scans):
         if scan.present:
             scan.check(f"{path}scans[{i}]")
 
 
 def units(config: Config) -> list[Unit]:
-    """One per volume, task and budget."""
-    return [
-        Unit(f"{name}|{task}|{budget:g}", f"{name}, {task}, {budget:g}", 2.0)
-        for name in _subjects(config)
-        for task in config.tasks
-        for budget in config.budgets
-    ]
+    """One per volume."""
+    named = [(name, k) for k in range(config.each) for name in config.classes]
+    scanned = [(scan.file, k) for k in range(config.pieces) for scan in config.scans if scan.present]
+    return [Unit(f"{i}|{name}|{k}", f"{name} {k}", 4.0) for i, (name, k) in enumerate(named + scanned)]
 
 
 def compute(config: Config, unit: Unit, run: Run) -> Record:
-    """The record of one case."""
-    name, task, budget = unit.key.split("|")
-    common = {"volume": name, "task": task, "budget": float(budget)}
-    subject = run.memo(name, _subjects(config)[name])
-    answer = recommend(
-        subject.volume, float(budget), task=task, boundary="reflect", seconds=config.seconds, seed=config.seed
-    )
-    return {**common, **judged(answer, subject_errors(answer, subject))}
+    """The record of one volume: estimates and answers under each boundary."""
+    index, name, k = unit.key.split("|")
+    random = np.random.default_rng(seed_of(config.seed, int(index)))
+    subject = _subject(config, name, int(k), random, run)
+    costs = run.memo("costs", lambda: _costs(config))
+    chosen = random.permutation(len(Boundary))[: config.boundaries]
+    return {
+        "class": name if name in CLASSES else "scans",
+        "label": subject.label if name in CLASSES else f"{name}, {subject.label}",
+        "half": HALVES[int(k) % 2],
+        "differentiable": subject.differentiable,
+        "boundaries": [_judged(config, subject, list(Boundary)[i], costs, random) for i in chosen],
+    }
 
 
-def subject_errors(answer: Recommendation, subject: _Subject) -> list[float]:
-    """The true error of every candidate, in parts of the range, counted as the task counts."""
-    low, high = answer.value_range
-    known: dict[tuple[str, str | None], float] = {}
-    for candidate in answer.candidates:
-        way = candidate.method, candidate.storage
-        if way not in known:  # schemes compute the same field
-            field = fl.reconstruct(subject.volume, boundary=answer.boundary, **candidate.options())
-            value, gradient = evaluate(field, subject.points.float())
-            errors = [float(metrics.rms(value.double(), subject.value))]
-            if answer.task != "resample":
-                errors.append(float(metrics.rms(gradient.double(), subject.gradient, vectors=True)))
-            known[way] = max(errors) / (high - low)
-    return [known[c.method, c.storage] for c in answer.candidates]
+def _subject(config: Config, name: str, k: int, random: np.random.Generator, run: Run) -> Subject:
+    if name in CLASSES:
+        large = k % config.every == config.every // 2
+        return of_class(name, size_of(random, *(config.large if large else config.sizes)), config.points, random)
+    scan = next(s for s in config.scans if s.file == name)
+    samples = run.memo(name, lambda: scan.load().samples.double())
+    return of_scan(samples, k % 3 == 2, config.sizes[1], config.points, random)
 
 
-def judged(answer: Recommendation, errors: list[float]) -> dict[str, Any]:
-    """Whether the budget holds, and what the pick costs beside the cheapest that truly meets it."""
-    true = dict(zip(map(id, answer.candidates), errors, strict=True))
-    meeting = [c for c in answer.candidates if true[id(c)] <= answer.max_error]
-    cheapest = min(meeting, key=lambda c: c.seconds, default=None)
+# --- costs ------------------------------------------------------------------------------------------------------------
+
+
+def _costs(config: Config) -> dict[tuple[Way, int], WayCost]:
+    """Of all ways, for jets of order 0 and 1, measured on one volume."""
+    volume = fl.signals.marschner_lobb().sample(_COSTS_ON, dtype=torch.float32)
+    ways = [way for method in METHODS.values() for way in ways_of(method, torch.float32, True)]
+    return {
+        (way, order): cost
+        for order in (0, 1)
+        for way, cost in costs_of(volume.samples, volume, ways, Boundary.MIRROR, order, config.seconds / 2).items()
+    }
+
+
+def _carried_over(costs: Mapping[tuple[Way, int], WayCost], task: str, voxels: int) -> dict[Way, WayCost]:
+    order, part = (0 if task == "resample" else 1), voxels / _COSTS_ON**3
+    return {
+        way: WayCost(cost.build * part, cost.nanoseconds, round(cost.memory * part))
+        for (way, known), cost in costs.items()
+        if known == order
+    }
+
+
+# --- truth ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True errors of a field: of value and gradient, and the second derivative along lines; in parts of the range."""
+
+    value: float
+    gradient: float
+    bend: float
+
+    def counted(self, task: str, step: float | None) -> float:
+        """As the task counts it."""
+        own = self.value if task == "resample" else max(self.value, self.gradient)
+        return math.hypot(own, 0.0 if step is None else step**2 / 24 * self.bend)
+
+
+def truth_of(subject: Subject, boundary: Boundary, way: Way, span: float) -> Truth:
+    """Of the field that a way makes of the volume."""
+    field = fl.reconstruct(subject.volume, way[0], boundary=boundary, storage=way[2])
+    value, gradient = field.value_and_gradient(subject.points)
+    off = ((value.double() - subject.value) / span).square(), ((gradient.double() - subject.gradient) / span).square()
+    bend = (subject.second_derivative / span).square()
+    means = [float((subject.weights * x).sum()) for x in (off[0], off[1].sum(-1), bend)]
+    return Truth(*(math.sqrt(mean) for mean in means))
+
+
+# --- judgement --------------------------------------------------------------------------------------------------------
+
+
+def _judged(
+    config: Config,
+    subject: Subject,
+    boundary: Boundary,
+    costs: Mapping[tuple[Way, int], WayCost],
+    random: np.random.Generator,
+) -> dict[str, Any]:
+    """Estimates and answers under a boundary."""
+    yardstick = Yardstick.of(subject.volume[None], None, boundary, config.seed)
+    errors = errors_of(yardstick, list(METHODS), subject.volume.dtype, lambda _: True)
+    known: dict[tuple[str, str | None], Truth] = {}
+    for way in errors:
+        if (way[0], way[2]) not in known:  # schemes compute the same field
+            known[way[0], way[2]] = truth_of(subject, boundary, way, yardstick.span)
+    truths = {way: known[way[0], way[2]] for way in errors}
+    return {
+        "boundary": str(boundary),
+        "fall": yardstick.fall,
+        "doubts": dict(yardstick.doubts),
+        "bend": [yardstick.bend, next(iter(truths.values())).bend],
+        "ways": list(_compared(yardstick, errors, truths)),
+        "answers": list(_answers(config, subject, yardstick, errors, truths, costs, random)),
+    }
+
+
+def _compared(
+    yardstick: Yardstick, errors: Mapping[Way, MethodErrors], truths: Mapping[Way, Truth]
+) -> Iterator[dict[str, Any]]:
+    """Every method and storage once: what was measured, and what is true."""
+    seen = set()
+    for way, found in errors.items():
+        if (way[0], way[2]) not in seen:
+            seen.add((way[0], way[2]))
+            estimates = {task: yardstick.estimate(task, found) for task in ("resample", "isosurface")}
+            yield {
+                "method": way[0],
+                "storage": way[2],
+                "value": [number(found.value.rms), found.value.spread, number(truths[way].value)],
+                "gradient": [number(found.gradient.rms), found.gradient.spread, number(truths[way].gradient)],
+                **{task: [number(e.low), number(e.high)] for task, e in estimates.items()},
+            }
+
+
+def _answers(
+    config: Config,
+    subject: Subject,
+    yardstick: Yardstick,
+    errors: Mapping[Way, MethodErrors],
+    truths: Mapping[Way, Truth],
+    costs: Mapping[tuple[Way, int], WayCost],
+    random: np.random.Generator,
+) -> Iterator[dict[str, Any]]:
+    """For every task and budget."""
+    volume = as_volume(subject.volume)
+    for task in TASKS if subject.differentiable else TASKS[:1]:
+        taken = _carried_over(costs, task, subject.volume.numel())
+        for near, budget in _budgets(config, task, truths, random):
+            question = Question(task, budget, math.inf, math.inf, str(yardstick.boundary), "refuse")
+            answer = choose(question, volume, yardstick, errors, taken)
+            yield {"near": near, **judged(answer, partial(_true, task, truths))}
+
+
+def _true(task: str, truths: Mapping[Way, Truth], candidate: Candidate) -> float:
+    return truths[candidate.method, candidate.scheme, candidate.storage].counted(task, candidate.step)
+
+
+def _budgets(
+    config: Config, task: str, truths: Mapping[Way, Truth], random: np.random.Generator
+) -> Iterator[tuple[bool, float]]:
+    """(whether it is near the true errors, budget)."""
+    plain = [t.counted(task, None) for way, t in truths.items() if way[2] is None]
+    around = max(min(plain), 1e-9) / _AROUND, max(*plain, 1e-9) * _AROUND
+    for i in range(config.budgets):
+        low, high = around if i % 2 else _BUDGETS
+        yield bool(i % 2), low * (high / low) ** random.random()
+
+
+def judged(answer: Recommendation, true: Callable[[Candidate], float]) -> dict[str, Any]:
+    """An answer beside the truth.
+
+    kept: of a pick, whether the budget holds; justified: of a refusal, whether nothing meets it; undecided: whether
+    something may, as far as intervals tell; factor: what the pick costs ÷ the cheapest that truly meets the budget.
+    """
     pick = answer.pick
-    holds = pick is None or true[id(pick)] <= answer.max_error
-    factor = pick.seconds / cheapest.seconds if pick is not None and cheapest is not None else None
+    meeting = [c for c in answer.candidates if true(c) <= answer.max_error]
+    cheapest = min((c.seconds for c in meeting), default=None)
+    shown = pick or answer.best
     return {
-        "pick": None if pick is None else _described(pick, true[id(pick)]),
-        "cheapest": None if cheapest is None else _described(cheapest, true[id(cheapest)]),
-        "best": _described(answer.best, true[id(answer.best)]),
-        "holds": holds,
-        "factor": factor,
-        "near": cheapest is None if pick is None else factor is not None and factor <= FACTOR,
-        "ways": [_described(c, true[id(c)]) for c in answer.candidates if c.storage is None],
+        "task": answer.task,
+        "budget": answer.max_error,
+        "picked": pick is not None,
+        "way": [shown.method, shown.storage, shown.step],
+        "true": number(true(shown)),
+        "interval": [number(shown.error.low), number(shown.error.high)],
+        "kept": None if pick is None else true(pick) <= answer.max_error,
+        "undecided": pick is None and any(c.error.low <= answer.max_error for c in answer.candidates),
+        "justified": None if pick is not None else not meeting,
+        "factor": None if pick is None or cheapest is None else pick.seconds / cheapest,
     }
 
 
-def _described(candidate: Candidate, true: float) -> dict[str, Any]:
-    error = candidate.error
-    return {
-        "method": candidate.method,
-        "scheme": candidate.scheme,
-        "storage": candidate.storage,
-        "seconds": candidate.seconds,
-        "predicted": error.predicted,
-        "measured": error.measured,
-        "high": error.high,
-        "resolved": candidate.resolved,
-        "true": number(true if math.isfinite(true) else math.nan),
-    }
+# --- calibration ------------------------------------------------------------------------------------------------------
+
+
+def fitted(records: Sequence[Record]) -> dict[str, tuple[list[float], list[float]]]:
+    """c and C of `filterlab.recommendation.calibration`, from the records of the tuning half."""
+    tuning = [r for r in records if r["half"] == HALVES[0]]
+    return {quantity: _quantiles(_needed(tuning, quantity)) for quantity in CALIBRATION}
+
+
+def _needed(records: Sequence[Record], quantity: str) -> np.ndarray:
+    """(N, 3): φ, and the c and the C with which each interval would just have held, where the doubt counts at all."""
+    rows = []
+    for record in records:
+        for found in record["boundaries"] if record["differentiable"] or quantity == "value" else ():
+            doubt = found["doubts"][quantity]
+            for d, spread, t in _pairs(found, quantity):
+                if d is not None and t is not None and doubt > _COUNTS * d:
+                    sampled = 1 + SURE * spread
+                    below, above = max(d / sampled - t, 0.0), math.sqrt(max(t**2 - (d * sampled) ** 2, 0.0))
+                    rows.append((found["fall"], below / doubt, above / doubt))
+    return np.array(rows).reshape(-1, 3)
+
+
+def _pairs(found: Mapping[str, Any], quantity: str) -> list[list[Any]]:
+    """(distance, its spread, truth) of every method as it comes; of the second derivative, of the reference."""
+    if quantity == "bend":
+        measured, true = found["bend"]
+        return [[measured, 0.0, true]]
+    return [way[quantity] for way in found["ways"] if way["storage"] is None]
+
+
+def _quantiles(rows: np.ndarray) -> tuple[list[float], list[float]]:
+    """At each of `FALLS`, over what lies between its neighbours; infinite where nothing does."""
+    ends = (-math.inf, *FALLS, math.inf)
+    factors: tuple[list[float], list[float]] = ([], [])
+    for i in range(1, len(ends) - 1):
+        near = rows[(rows[:, 0] >= ends[i - 1]) & (rows[:, 0] <= ends[i + 1])]
+        for column, known in enumerate(factors):
+            found = float(np.quantile(near[:, column + 1], _HELD)) if len(near) else math.inf
+            known.append(found)
+    return factors

@@ -272,8 +272,8 @@ class Info:
 class Recommend:
     """Find the cheapest method whose error on this volume stays within a budget.
 
-    Errors are predicted from the volume's spectrum and measured by leaving out every second sample; costs are measured
-    on this machine. The exit code is 3 when nothing meets the budget (the best there is is shown, and written).
+    Every method is built as it would be used and compared with the best estimate of the signal; costs are measured on
+    this machine. The exit code is 3 when nothing meets the budget (the best there is is shown, and written).
 
     examples:
       filterlab recommend engine.nrrd --max-error 0.5%
@@ -313,7 +313,7 @@ class Recommend:
             _check_not_input(self.output, self.volume)
 
         from filterlab.io.volumes import describe, load_volume
-        from filterlab.missing_values import CHOICES
+        from filterlab.missing_values import CHOICES, resolved
         from filterlab.recommendation import TASKS, recommend, report
         from filterlab.volume import Boundary
 
@@ -326,6 +326,13 @@ class Recommend:
         if self.output is not None and len(shape := describe(self.volume).shape) != 3:
             raise ValueError(f"expected one volume (D, H, W) to write a scene of; {self.volume} has {tuple(shape)}")
         volume = load_volume(self.volume)
+        file, voxel = str(self.volume.resolve()), min(volume.spacing)
+        if self.output is not None:  # what would not render is refused before the work
+            samples, unknown = resolved(volume.samples, self.nan)
+            if unknown is not None:
+                raise ValueError("expected --nan fill to write a scene with; with propagate its picture has NaN in it")
+            low, high = samples.aminmax()
+            _check_scene(self.output, report.shown(file, (float(low), float(high)), voxel))
         with _progress_bar() as progress:
             found = recommend(
                 volume,
@@ -342,7 +349,7 @@ class Recommend:
         else:
             _show(report.text(found))
         if self.output is not None:
-            _write_yaml(self.output, report.scene(found, str(self.volume.resolve()), min(volume.spacing), self.nan))
+            _write_yaml(self.output, report.scene(found, file, voxel))
         return OK if found.pick is not None else NOTHING_FITS
 
 
@@ -385,14 +392,25 @@ def _progress_bar() -> Iterator[Callable[[float, str], None]]:
         yield lambda done, what: bar.update(task, completed=done, description=what)
 
 
-def _write_yaml(path: Path, content: dict[str, Any]) -> None:
-    """A scene, checked as `filterlab render` will check it, then written."""
-    from filterlab.io.atomic import atomic_write
+def _check_scene(path: Path, content: dict[str, Any]) -> str:
+    """A scene as YAML. Raises ValueError for what `filterlab render` would refuse, or no file can hold."""
     from filterlab.io.config import dump_data, loads_config
     from filterlab.render.scene import Scene
 
+    try:
+        content["volume"].encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"expected a name in UTF-8 to write into a scene; got {content['volume']!r}") from None
     text = dump_data(content)
     loads_config(text, Scene, name=str(path))
+    return text
+
+
+def _write_yaml(path: Path, content: dict[str, Any]) -> None:
+    """A scene, checked, then written."""
+    from filterlab.io.atomic import atomic_write
+
+    text = _check_scene(path, content)
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -9,7 +9,15 @@ import torch
 
 import filterlab as fl
 from filterlab import metrics
-from filterlab.prediction import INNER, predicted_error, rms_second_derivative, spectrum_of
+from filterlab.prediction import (
+    INNER,
+    Spectrum,
+    _rows,
+    _squared_error,
+    predicted_error,
+    rms_second_derivative,
+    spectrum_of,
+)
 
 SMOOTH = [("marschner-lobb", {}, 64), ("gaussian", {"sigma": 0.15}, 24)]
 
@@ -109,3 +117,28 @@ def test_a_tensor_kernel_is_refused() -> None:
     kernel = fl.kernels.bc(torch.tensor(0.3), torch.tensor(0.3))
     with pytest.raises(TypeError, match="exact kernels"):
         predicted_error(spectrum_of(torch.rand(4, 4, 4)), kernel, prefilter=False)
+
+
+def test_no_signal_falls_slower_than_its_energy_is_finite() -> None:
+    """White noise does not fall within the band; beyond it is taken to fall as |ω|⁻⁶, what falls faster as it does."""
+    noise = torch.rand(32, 32, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert spectrum_of(noise).fall == 6.0
+    assert spectrum_of(fl.signals.gaussian(sigma=0.15).sample(24).samples).fall > 8.0
+
+
+def test_gradients_from_beyond_are_per_voxel_of_the_samples_at_any_step() -> None:
+    """What lies beyond the Nyquist frequency alone: power of a shell, by quadrature of its own."""
+    level, fall, step = 0.7, 8.0, 2
+    nothing = Spectrum(torch.zeros(8, 8, 8, dtype=torch.float64), level, fall)
+    method = fl.methods.named("trilinear")
+    omega = 3 * math.pi * (2 * torch.rand(200_000, 3, generator=torch.Generator().manual_seed(0)).double() - 1)
+    radius = omega.norm(dim=-1)
+    power = level * radius**-fall * ((omega.abs().amax(-1) > math.pi) & (radius <= 3 * math.pi))
+    slopes = [
+        _squared_error(row, axis, method.prefilter, (step * omega).unbind(-1)) / step**2
+        for axis, row in zip((0, 1, 2), _rows(method, "analytic")[1:], strict=True)
+    ]
+    squared = (6 * math.pi) ** 3 * float((power * sum(slopes)).mean())
+    found = predicted_error(nothing, method, step=step)
+    assert found.gradient == pytest.approx(math.sqrt(squared), rel=0.05)
+    assert found.beyond == 1

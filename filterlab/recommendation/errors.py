@@ -1,33 +1,43 @@
-"""Errors of every method on a volume: predicted from its spectrum, and measured by leaving samples out.
+"""Errors of methods on a volume: how far each is from the best estimate of the signal, and how far that may be off.
 
-blocks of the volume ─┬─▶ spectrum ──▶ predicted error of every method, at this resolution and at half of it
-                      └─▶ every second sample ──▶ rebuilt, compared with the rest: measured error at half of it
-measured at half · predicted here / predicted at half  =  the measured error, corrected for the resolution
+Letters: f the signal, r the reference (a spline of degree 7 that needs no boundary), r₃ the same of degree 3, f_M the
+field of a method under the boundary asked for, in the arithmetic that is used; ‖·‖ a root mean square over the region,
+in parts of the range of the samples.
+
+    d = ‖f_M − r‖   measured: kernel, prefilter, boundary, storage and rounding are all in it
+    u = ‖r − r₃‖    the doubt: what two splines make of the same samples
+    φ               how the spectrum falls towards the Nyquist frequency, decibels over a quarter of the band
+
+    d − c u ≤ ‖f_M − f‖ ≤ √(d² + (C u)²),        c, C functions of φ
+
+What lies beyond the Nyquist frequency is in no sample, so that ‖r − f‖ itself can't be measured. But it is near to u
+where the spectrum falls steeply, and several times u where it does not: `calibration` has the factors.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
+from torch.quasirandom import SobolEngine
 
-from filterlab import metrics
-from filterlab.kernels import bspline
+from filterlab.fields.storage import STORAGE
 from filterlab.methods import reconstruct
-from filterlab.prediction import Spectrum, predicted_error, rms_second_derivative, spectrum_of
-from filterlab.volume import Volume
+from filterlab.recommendation.calibration import factors
+from filterlab.recommendation.reference import endless_spline
+from filterlab.recommendation.survey import Patch, patches_of
+from filterlab.volume import Boundary
 
-_BLOCK, _BLOCKS = 64, 8
-_WHOLE = 96**3  # voxels of a volume that is one block
-_POINTS = 6000  # of a block at which a rebuilt field is compared
-_ROUNDING = 1e-6  # parts of the range: about what float32 leaves
-_RESOLVED = 0.1  # or less of the squared error comes from beyond the Nyquist frequency
-_DOUBT = 1.02  # of what is measured: by so much a method may be further off than it seems, the sampling apart
-_UNMEASURED = 1.5  # and so much where nothing could be held out
+_DEGREES = (7, 3)
+_RESOLVED, _ROUNDING = 10.0, 1e-6  # decibels; about what float32 leaves of a range
+SURE = 2.5  # standard errors that the mean over points may be off by
+_SEGMENT, BANDS = 32, 8  # samples of a line whose spectrum is taken; parts of the band up to the Nyquist frequency
+_STEEPEST = 60.0  # decibels
+_INTEGERS = tuple(name for name, dtype in STORAGE.items() if not dtype.is_floating_point)
+LARGEST = torch.finfo(torch.float32).max / 2**10  # of samples: coefficients and sums over them are larger
 
 
 @dataclass(frozen=True)
@@ -35,149 +45,233 @@ class ErrorEstimate:
     """An error in parts of the value range.
 
     Attributes:
-        predicted: from the spectrum.
-        measured: from the samples that were held out, corrected for the resolution; None: none could be.
-        low, high: between what it lies.
+        measured: from the best estimate of the signal.
+        doubt: how far two estimates of the signal are apart, counted as the task counts.
+        low, high: between what the error lies, in 95 of 100 cases.
     """
 
-    predicted: float
-    measured: float | None
+    measured: float
+    doubt: float
     low: float
     high: float
 
 
 @dataclass(frozen=True)
+class Distance:
+    """A root mean square over points, with its standard error relative to it."""
+
+    rms: float
+    spread: float = 0.0
+
+    def between(self, quantity: str, doubt: float, fall: float, rounding: float = 0.0) -> tuple[float, float]:
+        """(low, high) of the true error that has this distance from the reference."""
+        least, most = factors(quantity, fall)
+        sampled = 1 + SURE * self.spread
+        low = max(self.rms / sampled - least * doubt - rounding, 0.0)
+        return low, math.hypot(self.rms * sampled, most * doubt, rounding)
+
+
+@dataclass(frozen=True)
 class MethodErrors:
-    """RMS errors of one method over all blocks, (value, gradient per voxel).
+    """What was measured of one method with one storage.
 
     Attributes:
-        predicted: at the resolution of the volume.
-        measured: held out, corrected for the resolution; None: nothing could be held out.
-        spread: standard error of the mean square over blocks, relative to it.
-        beyond: part of the squared error that comes from beyond the Nyquist frequency.
+        value, gradient: distances from the reference, in parts of the range; gradients per voxel.
     """
 
-    predicted: tuple[float, float]
-    measured: tuple[float, float] | None
-    spread: float
-    beyond: float
-
-    def resolved(self, span: float) -> bool:
-        """Whether the volume resolves what it shows; an error that is rounding says nothing of that."""
-        return self.beyond < _RESOLVED or self.predicted[0] <= _ROUNDING * span
-
-    def estimate(self, task: str, span: float, rounding: tuple[float, float], lost: float = 0.0) -> ErrorEstimate:
-        """What the task counts, with what storage and step add."""
-
-        def counted(errors: tuple[float, float]) -> float:
-            both = [math.hypot(e, r) / span for e, r in zip(errors, rounding, strict=True)]
-            return math.hypot(both[0] if task == "resample" else max(both), lost)
-
-        predicted = counted(self.predicted)
-        measured = None if self.measured is None else counted(self.measured)
-        known = [predicted] if measured is None else [predicted, measured]
-        doubt = (_UNMEASURED if measured is None else _DOUBT) * math.sqrt(1 + self.spread)
-        return ErrorEstimate(predicted, measured, min(known) / doubt, max(known) * doubt)
+    value: Distance
+    gradient: Distance
 
 
 @dataclass(frozen=True)
-class Errors:
-    methods: dict[str, MethodErrors]
-    second_derivative: float
-
-
-def errors_of(samples: Tensor, names: Sequence[str], seed: int, tick: Callable[[float], None]) -> Errors:
-    """Of every method, from blocks of samples (V, D, H, W)."""
-    random = np.random.default_rng(seed)
-    blocks = list(_blocks(samples, random))
-    rows: dict[str, list[list[float]]] = {name: [] for name in names}
-    bends = []
-    for i, block in enumerate(blocks):
-        spectrum = spectrum_of(block)
-        bends.append(rms_second_derivative(spectrum) ** 2)
-        for name, row in _errors_of_block(block, spectrum, names, random).items():
-            rows[name].append(row)
-        tick((i + 1) / len(blocks))
-    found = {name: _combined(np.array(rows[name])) for name in names}
-    return Errors(found, math.sqrt(float(np.mean(bends))))
-
-
-def _blocks(samples: Tensor, random: np.random.Generator) -> Iterator[Tensor]:
-    """The whole volumes where they are small, else blocks at random."""
-    size = samples.shape[1:]
-    if math.prod(size) <= _WHOLE and len(samples) <= _BLOCKS:
-        yield from samples.unbind(0)
-        return
-    edges = [min(n, _BLOCK) for n in size]
-    for _ in range(_BLOCKS):
-        at = [int(random.integers(0, n - e + 1)) for n, e in zip(size, edges, strict=True)]
-        chosen = samples[int(random.integers(0, len(samples)))]
-        for dim, (first, edge) in enumerate(zip(at, edges, strict=True)):
-            chosen = chosen.narrow(dim, first, edge)
-        yield chosen
-
-
-def _errors_of_block(
-    block: Tensor, spectrum: Spectrum, names: Sequence[str], random: np.random.Generator
-) -> dict[str, list[float]]:
-    """Squared errors: predicted value, gradient; measured at half the resolution; predicted there; part beyond."""
-    rows = {}
-    held_out = _HoldOut.of(block, random)
-    for name in names:
-        here = predicted_error(spectrum, name)
-        row = [here.value**2, here.gradient**2, *[math.nan] * 4, here.beyond * here.value**2]
-        if held_out is not None:
-            there = predicted_error(spectrum, name, step=2)
-            value, gradient = held_out.error(name)
-            row[2:6] = [value**2, gradient**2, there.value**2, there.gradient**2]
-        rows[name] = row
-    return rows
-
-
-def _combined(rows: np.ndarray) -> MethodErrors:
-    mean = rows.mean(0)
-    predicted = math.sqrt(mean[0]), math.sqrt(mean[1])
-    spread = float(rows[:, 0].std(ddof=1) / math.sqrt(len(rows)) / mean[0]) if len(rows) > 1 and mean[0] > 0 else 0.0
-    measured = None
-    if math.isfinite(mean[2]):
-        ratios = [mean[k] / mean[k + 2] if mean[k + 2] > 0 else 1.0 for k in (2, 3)]
-        measured = predicted[0] * math.sqrt(ratios[0]), predicted[1] * math.sqrt(ratios[1])
-    return MethodErrors(predicted, measured, spread, float(mean[6] / mean[0]) if mean[0] > 0 else 0.0)
-
-
-@dataclass(frozen=True)
-class _HoldOut:
-    """A block of which every second sample is kept, to be rebuilt.
+class Yardstick:
+    """The reference at points of a volume, and what fields are compared by. Errors are in parts of the range.
 
     Attributes:
-        kept: the samples that are kept, a volume on the same world.
-        points: where fields are compared (P, 3).
-        value, gradient: of the block itself, from a spline of degree five.
+        boundary: of the fields.
+        value_range: the least and the largest sample.
+        patches, truth: parts of the volume, and (value, gradient) of the reference at their points.
+        doubts: u of "value", "gradient" and "bend", the second derivative along lines.
+        rounding: of the samples, by their floating type, RMS at most.
+        bend: RMS of that of the reference.
+        fall: φ.
     """
 
-    kept: Volume
-    points: Tensor
-    value: Tensor
-    gradient: Tensor
+    boundary: Boundary
+    value_range: tuple[float, float]
+    patches: tuple[Patch, ...]
+    truth: tuple[tuple[Tensor, Tensor], ...]
+    doubts: Mapping[str, float]
+    rounding: float
+    bend: float
+    fall: float
+
+    @property
+    def span(self) -> float:
+        """What errors are parts of."""
+        return range_of(self.value_range)
+
+    @property
+    def resolved(self) -> bool:
+        """Whether the samples resolve what they show: the spectrum falls, or what two splines differ by is rounding."""
+        return self.fall >= _RESOLVED or self.doubts["value"] <= _ROUNDING
 
     @classmethod
-    def of(cls, block: Tensor, random: np.random.Generator) -> _HoldOut | None:
-        """None for a block of which nothing can be left out."""
-        step = [2 if n >= 16 or n == 1 else 0 for n in block.shape]
-        if 0 in step or max(block.shape) < 16:
-            return None
-        exact = block.to("cpu", torch.float64)
-        kept = exact[tuple(slice(None, None, s) for s in step)]
-        size = torch.tensor([2.0 * (n - 1) for n in reversed(kept.shape)], dtype=torch.float64)
-        unit = torch.tensor(random.random((_POINTS, 3)))
-        points = size * (0.5 + 0.9 * (unit - 0.5))
-        reference = reconstruct(exact, bspline(5), boundary="reflect")
-        value, gradient = reference.value_and_gradient(points)
-        return cls(Volume(kept, spacing=2.0), points, value, gradient)
+    def of(
+        cls,
+        samples: Tensor,
+        unknown: Tensor | None,
+        boundary: Boundary,
+        seed: int = 0,
+        tick: Callable[[float], None] = lambda done: None,
+    ) -> Yardstick:
+        """From samples (V, D, H, W), and the mask of those without a value.
 
-    def error(self, method: str) -> tuple[float, float]:
-        """RMS of value and gradient of the field rebuilt by a method."""
-        field = reconstruct(self.kept, method, boundary="reflect")
-        value, gradient = field.value_and_gradient(self.points)
-        off = metrics.rms(value, self.value), metrics.rms(gradient, self.gradient, vectors=True)
-        return float(off[0]), float(off[1])
+        Raises:
+            ValueError: no samples, or samples that overflow when fields are evaluated.
+        """
+        value_range = _range(samples)
+        patches = tuple(patches_of(samples, unknown, boundary, SobolEngine(4, scramble=True, seed=seed)))
+        bare = cls(boundary, value_range, patches, (), {}, 0.0, 0.0, 0.0)
+        truth, sums, bands = [], torch.zeros(4, dtype=torch.float64), torch.zeros(BANDS, dtype=torch.float64)
+        for i, patch in enumerate(patches):
+            fine, coarse = (bare._jet(patch, degree) for degree in _DEGREES)
+            truth.append(fine[:2])
+            off = [(a - b).flatten(1).square().sum(-1) for a, b in zip(fine[:2], coarse[:2], strict=True)]
+            sums += torch.stack((*off, _along_lines(fine[2] - coarse[2]), _along_lines(fine[2]))) @ patch.weights
+            bands += float(patch.weights.sum()) * band_powers(bare._scaled(patch.samples))
+            tick((i + 1) / len(patches))
+        *doubts, bend = sums.sqrt().tolist()
+        named = dict(zip(("value", "gradient", "bend"), doubts, strict=True))
+        rounding = _rounding_of(samples.dtype) * max(map(abs, value_range)) / bare.span
+        return replace(bare, truth=tuple(truth), doubts=named, rounding=rounding, bend=bend, fall=fall_of(bands))
+
+    def _jet(self, patch: Patch, degree: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Value (P, 1), gradient (P, 3), Hessian (P, 3, 3) of the reference, in parts of the range."""
+        spline = endless_spline(self._scaled(patch.samples), degree)
+        value, gradient, hessian = spline.jet(patch.points.double() + patch.shift, 2)
+        return value[:, None], gradient, hessian
+
+    def _scaled(self, x: Tensor) -> Tensor:
+        """In parts of the range, float64: nothing under- or overflows when it is squared."""
+        return (x.double() - self.value_range[0]) / self.span
+
+    def errors(self, method: str, storage: str | None = None) -> MethodErrors:
+        """Of a method: distances of its fields from the reference. Raises ValueError for a storage that can't hold it.
+
+        Where patches were cut out, integers are coarser in the whole volume, by as much as its range is larger.
+        """
+        squares = []
+        for patch, (value, gradient) in zip(self.patches, self.truth, strict=True):
+            coarser = patch.coarser if storage in _INTEGERS else 1.0
+            v, g = self._of_field(patch, method, storage if coarser == 1 else None)
+            if coarser != 1:
+                v, g = (
+                    a + coarser * (b - a) for a, b in zip((v, g), self._of_field(patch, method, storage), strict=True)
+                )
+            off = torch.stack(((v - value[:, 0]).square(), (g - gradient).square().sum(-1)))
+            squares.append(patch.weights * off)
+        value, gradient = (_distance([s[row] for s in squares]) for row in (0, 1))
+        return MethodErrors(value, gradient)
+
+    def _of_field(self, patch: Patch, method: str, storage: str | None) -> tuple[Tensor, Tensor]:
+        """Value and gradient at the points, in parts of the range."""
+        made = reconstruct(patch.extended, method, boundary=self.boundary, storage=storage)
+        value, gradient = made.value_and_gradient(patch.points)
+        return self._scaled(value), gradient.double() / self.span
+
+    def estimate(self, task: str, errors: MethodErrors, step: float | None = None) -> ErrorEstimate:
+        """What the task counts, with what a march loses by a step."""
+        parts = {"value": errors.value} if task == "resample" else {"value": errors.value, "gradient": errors.gradient}
+        known = {"value": self.rounding, "gradient": 0.0}  # what is rounded alike has no gradient; what is not is in u
+        ends = [d.between(name, self.doubts[name], self.fall, known[name]) for name, d in parts.items()]
+        lost = 0.0 if step is None else step**2 / 24
+        bent = Distance(self.bend).between("bend", self.doubts["bend"], self.fall)
+        return ErrorEstimate(
+            math.hypot(max(d.rms for d in parts.values()), lost * self.bend),
+            math.hypot(max(self.doubts[name] for name in parts), lost * self.doubts["bend"]),
+            math.hypot(max(low for low, _ in ends), lost * bent[0]),
+            math.hypot(max(high for _, high in ends), lost * bent[1]),
+        )
+
+
+def range_of(value_range: tuple[float, float]) -> float:
+    """The range of samples; of samples that are all equal, their magnitude; 1 where they are 0."""
+    low, high = value_range
+    return (high - low) or abs(low) or 1.0
+
+
+def _rounding_of(dtype: torch.dtype) -> float:
+    """RMS of the rounding of a number, in parts of it, at most: uniform in half a unit of its last digit. Integers are
+    taken as they are."""
+    return torch.finfo(dtype).eps / math.sqrt(12) if dtype.is_floating_point else 0.0
+
+
+def _range(samples: Tensor) -> tuple[float, float]:
+    """The least and the largest sample. Raises ValueError for none, and for what overflows when it is computed with."""
+    if samples.numel() == 0:
+        raise ValueError(f"expected a volume with samples; got shape {tuple(samples.shape)}")
+    low, high = (float(end) for end in samples.aminmax())
+    if max(abs(low), abs(high)) > LARGEST:
+        raise ValueError(
+            f"expected samples within ±{LARGEST:.3g}, as fields are evaluated in float32; got {low:.3g} … {high:.3g}"
+        )
+    return low, high
+
+
+def _distance(squares: list[Tensor]) -> Distance:
+    """From weighted squares at the points of every patch; points of a patch that was cut out are one draw."""
+    draws = squares[0] if len(squares) == 1 else torch.stack([s.sum() for s in squares])
+    total = float(draws.sum())
+    if not 0 < total < math.inf:
+        return Distance(0.0 if total == 0 else math.inf)
+    spread = float(draws.std()) * math.sqrt(len(draws)) / total if len(draws) > 1 else 0.0  # of the mean square
+    return Distance(math.sqrt(total), 0.5 * spread)
+
+
+def _along_lines(hessian: Tensor) -> Tensor:
+    """Mean of (eᵀ H e)² over directions e: (2 |H|² + (tr H)²) / 15."""
+    trace = hessian.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return (2 * hessian.square().sum((-2, -1)) + trace.square()) / 15
+
+
+# --- how the spectrum falls -------------------------------------------------------------------------------------------
+
+
+def fall_of(bands: Tensor) -> float:
+    """φ in decibels: of the power density in the sixth and in the last of eight parts of the band; 0 … 60.
+
+    0 where no line is long enough to tell: nothing is known of the fall then.
+    """
+    sixth, last = float(bands[5]), float(bands[7])
+    if not sixth > 0:
+        return 0.0
+    return min(max(10 * math.log10(sixth / last), 0.0), _STEEPEST) if last > 0 else _STEEPEST
+
+
+def band_powers(samples: Tensor) -> Tensor:
+    """Mean power density in eight parts of the band up to the Nyquist frequency, along all lines of (D, H, W).
+
+    Lines are cut into segments of 32 samples that overlap by half, and windowed by sin³. Second differences are taken,
+    and divided out of the spectrum, so that slow changes don't leak into what is above them. Welch, The use of fast
+    Fourier transform for the estimation of power spectra, 1967.
+    """
+    total = torch.zeros(BANDS, dtype=torch.float64)
+    for dim, n in enumerate(samples.shape):
+        if n >= BANDS:
+            bent = torch.diff(samples.movedim(dim, -1), n=2)
+            for part in bent.split(max(1, 2**20 // bent[0].numel())):
+                total += _periodogram(part) * (len(part) / len(bent))
+    return total
+
+
+def _periodogram(lines: Tensor) -> Tensor:
+    """Of second differences (..., M): mean power density of the lines in every part of the band, the second
+    differences divided out."""
+    length = min(lines.shape[-1], _SEGMENT)
+    segments = lines.unfold(-1, length, max(1, length // 2))
+    window = torch.sin(math.pi * (torch.arange(length, dtype=lines.dtype) + 1) / (length + 1)) ** 3
+    spectrum = torch.fft.rfft(segments * window, n=2 * _SEGMENT)
+    power = spectrum.abs().square().flatten(0, -2).mean(0)[1:] / window.square().sum()
+    omega = math.pi * torch.arange(1, _SEGMENT + 1, dtype=lines.dtype) / _SEGMENT
+    return (power / (2 * torch.sin(omega / 2)) ** 4).reshape(BANDS, -1).mean(-1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Any
 
 from rich.console import Group
@@ -10,6 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from filterlab.recommendation.choice import IMAGE, Candidate, Recommendation
+from filterlab.recommendation.errors import range_of
+from filterlab.recommendation.survey import INNER
 
 COUNTED = {
     "resample": "RMS of the value",
@@ -31,18 +34,21 @@ def text(found: Recommendation) -> Group:
 def sentences(found: Recommendation) -> list[str]:
     """What is counted, and what is recommended; or why nothing is, and the most accurate there is."""
     low, high = found.value_range
-    lines = [f"Error: {COUNTED[found.task]}, in parts of the range {low:.6g} … {high:.6g}; inner 0.9 of the volume."]
+    counted = f"{COUNTED[found.task]}, in parts of the range {low:.6g} … {high:.6g}"
+    lines = [f"Error: {counted}; inner {INNER} of the volume."]
     chosen = found.chosen
     if found.pick is not None:
         lines.append(f"Recommended: {_named(chosen)}, {_interval(chosen)} for a budget of {percent(found.max_error)}.")
     else:
-        lines.append(f"Nothing meets the budget: {_why_not(found)}")
+        lines.append(f"Nothing surely meets the budget: {_why_not(found)}")
         lines.append(f"The most accurate: {_named(chosen)}, {_interval(chosen)}.")
     return lines
 
 
 def _why_not(found: Recommendation) -> str:
     accurate = [c for c in found.candidates if c.error.high <= found.max_error]
+    if found.undecided and not accurate:
+        return "some error may be within it, but the samples do not tell."
     if not accurate:
         return f"no method here has an error of at most {percent(found.max_error)} on this volume."
     least_memory, least_time = min(c.memory for c in accurate), min(c.seconds for c in accurate)
@@ -61,11 +67,10 @@ def _table(found: Recommendation) -> Table:
     table = Table(box=None, padding=(0, 2))
     for name in ("", "method", "scheme", "storage", "step"):
         table.add_column(name)
-    for name in ("error", "predicted", "measured", "time", "per sample", "memory"):
+    for name in ("error", "measured", "time", "per sample", "memory"):
         table.add_column(name, justify="right")
     for candidate in (found.chosen, *found.runners_up()):
         mark = ("→" if found.pick else "best") if candidate is found.chosen else ""
-        measured = candidate.error.measured
         table.add_row(
             mark,
             candidate.method,
@@ -73,8 +78,7 @@ def _table(found: Recommendation) -> Table:
             candidate.storage or "as it comes",
             "–" if candidate.step is None else f"{candidate.step:g}",
             f"{percent(candidate.error.low)} … {percent(candidate.error.high)}",
-            percent(candidate.error.predicted),
-            "–" if measured is None else percent(measured),
+            percent(candidate.error.measured),
             duration(candidate.seconds),
             f"{candidate.nanoseconds:.3g} ns",
             size(candidate.memory),
@@ -84,11 +88,9 @@ def _table(found: Recommendation) -> Table:
 
 def _notes(found: Recommendation) -> list[str]:
     lines = [f"Time: prefilter and {DONE_ONCE[found.task]}, measured on this machine. Memory: coefficients."]
-    lines.append("Predicted: from the spectrum. Measured: every second sample held out, corrected for the resolution.")
-    if found.chosen.error.measured is None:
-        lines.append("Nothing could be held out: an axis has fewer than 16 voxels. The error is predicted only.")
+    lines.append("Error: between what it lies in 95 of 100 cases. Measured: from the best estimate of the signal.")
     if not found.chosen.resolved:
-        lines.append("The volume hardly resolves what it shows: much of the error rests on how its spectrum continues.")
+        lines.append("The volume hardly resolves what it shows: how far its best estimate is off, no sample tells.")
     return lines
 
 
@@ -136,7 +138,7 @@ def data(found: Recommendation) -> dict[str, Any]:
             "scheme": candidate.scheme,
             "storage": candidate.storage,
             "step": candidate.step,
-            "error": {"low": error.low, "high": error.high, "predicted": error.predicted, "measured": error.measured},
+            "error": {name: _finite(number) for name, number in asdict(error).items()},
             "resolved": candidate.resolved,
             "seconds": candidate.seconds,
             "nanoseconds_per_sample": candidate.nanoseconds,
@@ -151,24 +153,32 @@ def data(found: Recommendation) -> dict[str, Any]:
         "boundary": found.boundary,
         "value_range": list(found.value_range),
         "pick": plain(found.pick),
+        "undecided": found.undecided,
         "best": plain(found.best),
         "runners_up": [plain(c) for c in found.runners_up()],
     }
 
 
-def scene(found: Recommendation, file: str, voxel: float = 1.0, nan: str = "refuse") -> dict[str, Any]:
+def scene(found: Recommendation, file: str, voxel: float = 1.0) -> dict[str, Any]:
     """A scene that `filterlab render` takes: the volume, reconstructed as recommended, under a ramp of opacity."""
-    low, high = found.value_range
-    span = (high - low) or 1.0
     chosen = found.chosen
     method: dict[str, Any] = {"name": chosen.method, "scheme": chosen.scheme, "boundary": found.boundary}
     method |= {"storage": chosen.storage} if chosen.storage else {}
-    method |= {"nan": nan} if nan != "refuse" else {}
-    points = [(0.15, (0.1, 0.15, 0.3), 0.0), (0.5, (0.75, 0.55, 0.4), 0.15), (1.0, (1.0, 0.97, 0.9), 0.6)]
+    method |= {"nan": found.nan} if found.nan != "refuse" else {}
     return {
         "description": f"{chosen.method}, recommended for an error of {percent(found.max_error)} ({found.task})",
-        "volume": file,
+        **shown(file, found.value_range, voxel),
         "method": method,
+        "step": chosen.step or 0.5,
+    }
+
+
+def shown(file: str, value_range: tuple[float, float], voxel: float) -> dict[str, Any]:
+    """What of a scene is known before anything is recommended: the volume, and how it is shown."""
+    low, span = value_range[0], range_of(value_range)
+    points = [(0.15, (0.1, 0.15, 0.3), 0.0), (0.5, (0.75, 0.55, 0.4), 0.15), (1.0, (1.0, 0.97, 0.9), 0.6)]
+    return {
+        "volume": file,
         "transfer": {
             "unit": voxel,
             "points": [
@@ -176,7 +186,10 @@ def scene(found: Recommendation, file: str, voxel: float = 1.0, nan: str = "refu
                 for part, color, opacity in points
             ],
         },
-        "step": chosen.step or 0.5,
         "lighting": {"ambient": 0.3, "diffuse": 0.7},
         "termination": 0.002,
     }
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from filterlab import costs, metrics
+from filterlab import costs
 from filterlab.fields.grid import GridField
 from filterlab.methods import Method, reconstruct
 from filterlab.volume import Boundary, Volume
@@ -44,13 +44,11 @@ def _first_scheme(method: Method, dtype: torch.dtype) -> str:
 
 @dataclass(frozen=True)
 class WayCost:
-    """Seconds to build the whole field, nanoseconds per sample, bytes, and what the storage rounds off."""
+    """Seconds to build the whole field, nanoseconds per sample, bytes of its coefficients."""
 
     build: float
     nanoseconds: float
     memory: int
-    value_rounding: float
-    gradient_rounding: float
 
 
 def costs_of(
@@ -58,11 +56,14 @@ def costs_of(
     volume: Volume,
     ways: list[Way],
     boundary: Boundary,
-    task: str,
+    order: int,
     seconds: float,
-    tick: Callable[[float], None],
+    tick: Callable[[float], None] = lambda done: None,
 ) -> dict[Way, WayCost]:
-    """Of the ways that can run here: measured on the middle of (D, H, W), and carried over to the whole volume."""
+    """Of the ways that can run here: measured on the middle of (D, H, W), and carried over to the whole volume.
+
+    Samples are jets of that order: 0 values, 1 values and gradients.
+    """
     part = samples
     for dim, n in enumerate(samples.shape):
         edge = min(n, _CROP)
@@ -72,15 +73,12 @@ def costs_of(
     fields = {way: _built(part, way, boundary) for way in ways}
     runs = {way: field for way, field in fields.items() if field is not None and not _stored_so_anyway(way, fields)}
     builders = {"/".join(map(str, way)): (lambda way=way: _built(part, way, boundary)) for way in runs}
-    order = 0 if task == "resample" else 1
     taken = costs.measure(builders, points, order=order, seconds=seconds, tick=tick)  # type: ignore[arg-type]
     whole = math.prod(volume.shape) / part.numel()
     found = {}
     for way, field in runs.items():
         cost = taken["/".join(map(str, way))]
-        rounding = _rounding(field, runs[way[0], way[1], None], points)
-        memory = _memory_of_whole(field, volume)
-        found[way] = WayCost(cost.build.median * whole, cost.sample.median, memory, *rounding)
+        found[way] = WayCost(cost.build.median * whole, cost.sample.median, _memory_of_whole(field, volume))
     return found
 
 
@@ -110,14 +108,6 @@ def _points_along_rays(part: Tensor) -> Tensor:
     along = 0.5 * torch.arange(_SAMPLES, dtype=torch.float32)[:, None]
     points = start + along * direction / direction.norm(dim=-1, keepdim=True)
     return points.clamp_min(0).minimum(size).reshape(-1, 3).to(part.device)
-
-
-def _rounding(field: GridField, exact: GridField, points: Tensor) -> tuple[float, float]:
-    """RMS of value and gradient that the storage of `field` adds to `exact`."""
-    if field is exact:
-        return 0.0, 0.0
-    (v, g), (w, h) = (f.value_and_gradient(points) for f in (field, exact))
-    return float(metrics.rms(v, w)), float(metrics.rms(g, h, vectors=True))
 
 
 def _memory_of_whole(field: GridField, volume: Volume) -> int:

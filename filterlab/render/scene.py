@@ -125,8 +125,10 @@ class VolumeFile(StrictModel):
 
 def find_volume(name: str, folder: Path) -> Path:
     """The existing file that `name` stands for (see `VolumeFile`), absolute. Raises ValueError if there is none."""
-    path = Path(os.path.expandvars(name)).expanduser()
-    if "$" in str(path):
+    path = Path(name)
+    if not path.is_absolute() or not path.exists():  # else a name that is as it stands, with a $ in it or not
+        path = Path(os.path.expandvars(name)).expanduser()
+    if "$" in str(path) and not path.exists():
         raise ValueError(f"expected environment variables that are set; got {name!r}")
     volumes = os.environ.get(VOLUMES_VARIABLE)
     places = [Path("/")] if path.is_absolute() else [folder, Path()] + ([Path(volumes)] if volumes else [])
@@ -435,7 +437,14 @@ class Scene(StrictModel):
             raise ValueError("expected either a volume or a signal" + ("; got both" if self.volume else ""))
         if self.signal is not None and self.signal.samples is None and self.method is not None:
             raise ValueError("a signal that is not sampled needs no method: give signal.samples, or leave method out")
+        if self.transfer.axis == "raw":  # else the values are known with the volume
+            self.transfer.build(lambda: (0.0, 1.0), 1.0).to(self.dtype)
         return self
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of samples and arithmetic."""
+        return torch.float64 if self.precision == "float64" else torch.float32
 
     @property
     def step_or_default(self) -> float:
@@ -498,7 +507,7 @@ def build(scene: Scene) -> Prepared:
         "region": scene.region.build() if scene.region else None,
         "jitter_seed": scene.jitter,
         "termination": scene.termination,
-        "dtype": torch.float64 if scene.precision == "float64" else torch.float32,
+        "dtype": scene.dtype,
         "device": scene.device,
     }
     transfer = scene.transfer.build(value_range, field.domain.voxel_size)
@@ -536,7 +545,7 @@ def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]
 
 def _volume(scene: Scene) -> Volume | None:
     """The samples, in the type and on the device of the scene; None for a signal that is shown as it is."""
-    dtype = torch.float64 if scene.precision == "float64" else torch.float32
+    dtype = scene.dtype
     if scene.volume is not None:
         volume = scene.volume.load()
     else:

@@ -154,11 +154,13 @@ def tiny(name, scan):
         "finest": 32,
     }
     configs["recommend_validation"] = {
-        "signals": [{"signal": "gaussian", "resolutions": [16]}],
-        "waves": [{"bandwidths": [0.5], "resolution": 16}],
+        "classes": ["waves", "steps"],
+        "each": 2,
+        "sizes": [4, 12],
         "scans": [str(scan), {"file": "not_here.nrrd", "optional": True}],
-        "tasks": ["resample", "isosurface"],
-        "budgets": [0.05],
+        "pieces": 3,
+        "boundaries": 1,
+        "budgets": 2,
         "points": 200,
         "seconds": 0.01,
     }

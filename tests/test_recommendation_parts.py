@@ -1,0 +1,185 @@
+"""What recommendations stand on: the reference, points and their weights, how spectra fall, the error of a method."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch.quasirandom import SobolEngine
+
+import filterlab as fl
+from filterlab.recommendation import calibration, survey
+from filterlab.recommendation.calibration import CALIBRATION, FALLS, factors
+from filterlab.recommendation.errors import Yardstick, band_powers, fall_of
+from filterlab.recommendation.reference import endless_spline
+from filterlab.recommendation.survey import inner_box, patches_of
+from filterlab.volume import Boundary
+
+SIZES = [(1, 1, 1), (1, 2, 3), (4, 5, 6), (7, 9, 12), (16, 8, 30)]
+
+
+def sobol() -> SobolEngine:
+    return SobolEngine(4, scramble=True, seed=3)
+
+
+def polynomial(points: torch.Tensor, degree: int) -> torch.Tensor:
+    x, y, z = points.double().unbind(-1)
+    return (0.1 * x) ** degree + (0.2 * y + 1) ** degree - (0.15 * z) ** degree
+
+
+def voxels(size) -> torch.Tensor:
+    axes = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in size), indexing="ij")
+    return torch.stack(axes[::-1], -1)
+
+
+# --- the reference ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [3, 5, 7])
+@pytest.mark.parametrize("size", SIZES)
+def test_the_reference_interpolates(size, degree) -> None:
+    samples = torch.rand(size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.allclose(endless_spline(samples, degree)(voxels(size)), samples, atol=1e-10)
+
+
+@pytest.mark.parametrize("degree", [3, 5, 7])
+def test_the_reference_reproduces_polynomials_up_to_the_ends_and_no_further(degree) -> None:
+    size = (9, 11, 14)
+    points = torch.rand(500, 3, dtype=torch.float64) * torch.tensor([13.0, 10.0, 8.0], dtype=torch.float64)
+    for power in range(5):
+        field = endless_spline(polynomial(voxels(size), power), degree)
+        off = float((field(points) - polynomial(points, power)).abs().max())
+        assert (off < 1e-10) == (power < 4)
+
+
+# --- points and weights -----------------------------------------------------------------------------------------------
+
+
+def lumpy(shape, seed: int = 0) -> torch.Tensor:
+    """Noise in one corner, a smooth rest."""
+    x = torch.rand(shape, generator=torch.Generator().manual_seed(seed)) * 0.01
+    x[..., :5, :5, :5] += torch.rand(5, 5, 5, generator=torch.Generator().manual_seed(seed))
+    return x
+
+
+@pytest.mark.parametrize("shape", [(1, 40, 37, 50), (2, 6, 20, 9), (20, 8, 8, 8)])
+def test_means_over_points_are_means_over_the_region(shape) -> None:
+    """Wherever the points are drawn: of 1, of a polynomial, of a lump."""
+    lower, upper = inner_box(shape[1:])
+    even = lower + (upper - lower) * SobolEngine(3, scramble=True, seed=1).draw(2**15, dtype=torch.float64)
+    patches = patches_of(lumpy(shape), None, Boundary.MIRROR, sobol())
+    assert len(patches) == shape[0]
+    for function in (torch.ones_like, lambda p: 1 + (p / 10) ** 2, lambda p: torch.exp(-0.3 * p)):
+        found = sum(float((p.weights * function(p.points.double()).prod(-1)).sum()) for p in patches)
+        assert found == pytest.approx(float(function(even).prod(-1).mean()), rel=0.04)
+
+
+def test_weights_of_parts_add_up(monkeypatch) -> None:
+    monkeypatch.setattr(survey, "WHOLE", 100)
+    sums = [
+        sum(float(p.weights.sum()) for p in patches_of(lumpy((2, 40, 37, 50), seed), None, Boundary.MIRROR, sobol()))
+        for seed in range(5)
+    ]
+    assert sum(sums) / 5 == pytest.approx(1, abs=0.15)
+
+
+def test_most_points_are_where_the_detail_is_and_some_everywhere() -> None:
+    patch, = patches_of(lumpy((1, 40, 40, 40)), None, Boundary.MIRROR, sobol())  # fmt: skip
+    corner = (patch.points < 7).all(-1)
+    assert float(corner.double().mean()) > 20 * (6 / 36) ** 3  # its share of the volume
+    assert float((patch.points > 20).all(-1).double().mean()) > 0.02
+
+
+@pytest.mark.parametrize("boundary", list(Boundary))
+def test_parts_tell_what_the_whole_tells(boundary, monkeypatch) -> None:
+    """The same errors from cut-out patches as from the whole volume, at every end and under every boundary."""
+    signal = fl.signals.gaussian(sigma=0.25, center=(0.9, -0.9, 0.1))
+    samples = 1000 + signal.sample(72).samples
+    whole = Yardstick.of(samples[None], None, boundary)
+    monkeypatch.setattr(survey, "WHOLE", 1000)
+    parts = Yardstick.of(samples[None], None, boundary)
+    assert len(parts.patches) > 1
+    for method in ("trilinear", "tricubic"):
+        one, other = whole.errors(method).value, parts.errors(method).value
+        assert other.rms == pytest.approx(one.rms, rel=3 * (other.spread + one.spread) + 0.02)
+
+
+def test_integers_are_as_coarse_in_a_part_as_in_the_whole(monkeypatch) -> None:
+    """Of a quiet half beside a loud one: what uint8 rounds off is set by the range of the whole volume."""
+    samples = 0.001 * torch.rand(1, 24, 24, 200, generator=torch.Generator().manual_seed(0))
+    samples[..., :4] += torch.tensor([0.0, 1.0, 0.0, 1.0])
+    whole = Yardstick.of(samples, None, Boundary.MIRROR).errors("trilinear", "uint8").value.rms
+    monkeypatch.setattr(survey, "WHOLE", 1000)
+    monkeypatch.setattr(survey, "_BY_VOLUME", 0.9)
+    parts = Yardstick.of(samples, None, Boundary.MIRROR).errors("trilinear", "uint8").value.rms
+    assert parts == pytest.approx(whole, rel=0.25)
+
+
+def test_points_near_voxels_without_a_value_do_not_count() -> None:
+    samples = lumpy((1, 20, 20, 20))
+    unknown = torch.zeros(1, 20, 20, 20, dtype=torch.bool)
+    unknown[0, 10, 11, 12] = True
+    patch, = patches_of(samples, unknown, Boundary.MIRROR, sobol())  # fmt: skip
+    near = ((patch.points - torch.tensor([12.0, 11.0, 10.0])).abs() < 3).all(-1)
+    assert bool(near.any())
+    assert bool((patch.weights[near] == 0).all())
+    assert bool((patch.weights[~near & (patch.points < 8).all(-1)] > 0).all())
+
+
+# --- how spectra fall -------------------------------------------------------------------------------------------------
+
+
+def test_noise_does_not_fall() -> None:
+    noise = torch.rand(40, 40, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    bands = band_powers(noise)
+    assert bands[2:].numpy() == pytest.approx(3 / 12, rel=0.1)  # of three axes
+    assert fall_of(bands) < 0.5
+
+
+def test_waves_are_in_their_band() -> None:
+    x = torch.arange(64, dtype=torch.float64)
+    for band in range(2, 8):
+        wave = torch.cos(math.pi * (band + 0.5) / 8 * x).expand(16, 16, 64)
+        assert int(band_powers(wave).argmax()) == band
+
+
+def test_slow_changes_do_not_leak() -> None:
+    """A ramp has none of the power of the noise on it."""
+    noise = 1e-3 * torch.rand(8, 8, 100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ramp = torch.arange(100, dtype=torch.float64)
+    assert torch.allclose(band_powers(noise + ramp)[1:], band_powers(noise)[1:], rtol=1e-4)
+
+
+def test_short_lines_tell_nothing() -> None:
+    assert fall_of(band_powers(torch.rand(4, 5, 6, dtype=torch.float64))) == 0
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_gradients_are_told_apart_from_values() -> None:
+    """Of a plane wave of frequency ω, kept as it is: the gradient is off by about ω times as much, and more."""
+    x = torch.cos(0.6 * torch.arange(48, dtype=torch.float64)).expand(12, 12, 48)
+    found = Yardstick.of(x[None], None, Boundary.MIRROR).errors("trilinear")
+    line = torch.linspace(0, 1, 101, dtype=torch.float64)
+    value = (1 - line) * 1 + line * math.cos(0.6) - torch.cos(0.6 * line)
+    assert found.gradient.rms > 3 * found.value.rms > 0
+    assert found.value.rms < float(value.abs().max())
+    assert 0 < found.value.spread < 0.1
+
+
+def test_the_second_derivative_is_that_of_the_signal() -> None:
+    """Of a wave of frequency ω along x, of amplitude 1 and range 2: RMS over lines ω² / (2 √(2·5))."""
+    x = torch.cos(0.5 * torch.arange(60, dtype=torch.float64)).expand(20, 20, 60)
+    found = Yardstick.of(x[None], None, Boundary.MIRROR)
+    assert found.bend == pytest.approx(0.25 / 2 / math.sqrt(10), rel=0.03)
+
+
+def test_factors_lie_between_their_knots() -> None:
+    for quantity, (least, most) in CALIBRATION.items():
+        assert len(least) == len(most) == len(FALLS)
+        for fall, c, big in zip(FALLS, least, most, strict=True):
+            assert factors(quantity, fall) == (c, big)
+        assert factors(quantity, FALLS[-1] + 100) == (least[-1], most[-1])
+    assert calibration.factors("value", 1.5)[1] == pytest.approx(sum(CALIBRATION["value"][1][1:3]) / 2)
