@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -56,6 +57,20 @@ class Domain:
         return 2 * max(math.hypot(*offset) for offset in (corners - corners.mean(0)).tolist())
 
 
+class Named(Protocol):
+    """What has a name."""
+
+    @property
+    def name(self) -> str: ...
+
+
+@dataclass(frozen=True)
+class ClosedForm:
+    """The scheme of a field that is computed from its definition, with no coefficients."""
+
+    name: str = "closed form"
+
+
 class Field(ABC):
     """A function of space with value, gradient and (up to `max_order`) higher derivatives.
 
@@ -70,6 +85,7 @@ class Field(ABC):
     """
 
     domain: Domain
+    scheme: Named = ClosedForm()
     max_order: int = 2
     channels: tuple[int, int] | None = None
 

@@ -175,6 +175,8 @@ class GridField(Field):
         coefficients: the padded coefficients.
     """
 
+    scheme: Scheme
+
     def __init__(self, method: str, volume: Volume, coefficients: Coefficients, scheme: Scheme) -> None:
         self.method = method
         self.scheme = scheme

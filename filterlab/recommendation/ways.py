@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from filterlab import costs
+from filterlab.fields.base import Field
 from filterlab.fields.grid import GridField
 from filterlab.methods import Method, reconstruct
 from filterlab.volume import Boundary, Volume
@@ -37,9 +38,7 @@ def ways_of(method: Method, dtype: torch.dtype, all_of_them: bool) -> Iterator[W
 
 def _first_scheme(method: Method, dtype: torch.dtype) -> str:
     """What `reconstruct` takes for such samples when it is not told."""
-    field = reconstruct(torch.zeros(2, 2, 2, dtype=dtype), method)
-    assert isinstance(field, GridField)
-    return field.scheme.name
+    return reconstruct(torch.zeros(2, 2, 2, dtype=dtype), method).scheme.name
 
 
 @dataclass(frozen=True)
@@ -78,25 +77,23 @@ def costs_of(
     found = {}
     for way, field in runs.items():
         cost = taken["/".join(map(str, way))]
-        found[way] = WayCost(cost.build.median * whole, cost.sample.median, _memory_of_whole(field, volume))
+        found[way] = WayCost(cost.build.median * whole, cost.sample.median, _memory_of_whole(field, part, volume))
     return found
 
 
-def _built(part: Tensor, way: Way, boundary: Boundary) -> GridField | None:
+def _built(part: Tensor, way: Way, boundary: Boundary) -> Field | None:
     """The field, or None where it can't be as asked here (numbers that a short type does not hold, no fused scheme)."""
     method, scheme, storage = way
     try:
-        field = reconstruct(part, method, boundary=boundary, scheme=scheme, storage=storage)
+        return reconstruct(part, method, boundary=boundary, scheme=scheme, storage=storage)
     except ValueError:
         return None
-    assert isinstance(field, GridField)
-    return field
 
 
-def _stored_so_anyway(way: Way, fields: dict[Way, GridField | None]) -> bool:
+def _stored_so_anyway(way: Way, fields: dict[Way, Field | None]) -> bool:
     """Whether the storage asked for is the one that coefficients have without it."""
     field = fields.get((way[0], way[1], None))
-    return way[2] is not None and field is not None and str(field.coefficients.values.dtype) == f"torch.{way[2]}"
+    return isinstance(field, GridField) and str(field.coefficients.values.dtype) == f"torch.{way[2]}"
 
 
 def _points_along_rays(part: Tensor) -> Tensor:
@@ -110,8 +107,10 @@ def _points_along_rays(part: Tensor) -> Tensor:
     return points.clamp_min(0).minimum(size).reshape(-1, 3).to(part.device)
 
 
-def _memory_of_whole(field: GridField, volume: Volume) -> int:
+def _memory_of_whole(field: Field, part: Tensor, volume: Volume) -> int:
     """Bytes of the coefficients of all of the volume, padded as those of its part are."""
+    if not isinstance(field, GridField):
+        return costs.coefficient_bytes(field) * math.prod(volume.shape) // part.numel()
     values = field.coefficients.values
     pads = [n - m for n, m in zip(values.shape, reversed(field.coefficients.size), strict=True)]
     padded = [n + pad for n, pad in zip(volume.shape[-3:], pads, strict=True)]

@@ -92,7 +92,7 @@ def plan(prepared: Prepared) -> Plan:
     known = isinstance(field, GridField)
     return Plan(
         method=field.method if known else "exact",
-        scheme=field.scheme.name if known else "closed form",
+        scheme=field.scheme.name,
         storage=str(field.coefficients.values.dtype).removeprefix("torch.") if known else "–",
         taps=METHODS[field.method].facts.taps if known and field.method in METHODS else None,
         order=medium.order,
