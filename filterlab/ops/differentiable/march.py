@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from types import ModuleType
 
 import torch
@@ -39,6 +39,7 @@ def implementation_for(coefficients: Tensor) -> str:
     return "cuda" if coefficients.device.type == "cuda" else "cpu"
 
 
+@cache
 def _loaded(implementation: str) -> ModuleType:
     with forking.lock:
         if implementation == "cuda":

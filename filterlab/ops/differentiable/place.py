@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
+from types import ModuleType
 
 import torch
 from torch import Tensor
@@ -14,10 +16,15 @@ from filterlab.ops.reference import place as reference
 
 
 def _on_the_cpu(points: Tensor, placement: Placement) -> Placed:
-    with forking.lock:
-        from filterlab.ops.cpu import place  # it needs llvmlite
+    return _driver().place(points, placement)
 
-    return place.place(points, placement)
+
+@cache
+def _driver() -> ModuleType:
+    with forking.lock:
+        from filterlab.ops.cpu import place as driver  # it needs llvmlite
+
+    return driver
 
 
 IMPLEMENTATIONS: dict[str, Callable[[Tensor, Placement], Placed]] = {

@@ -14,6 +14,8 @@ F again, under the boundary `zeros`, for which E and C only pad and crop. So der
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from types import ModuleType
 
 import torch
 from torch import Tensor
@@ -160,10 +162,15 @@ def _fused(samples: Tensor, how: Filtering) -> Tensor:
 
 
 def _compute(samples: Tensor, how: Filtering) -> Tensor:
+    return _fused_driver().filter_axes(samples, how)
+
+
+@cache
+def _fused_driver() -> ModuleType:
     with forking.lock:
         from filterlab.ops.cpu import prefilter as fused  # it needs llvmlite
 
-    return fused.filter_axes(samples, how)
+    return fused
 
 
 def _adjoint(cotangents: Tensor, shape: torch.Size, how: Filtering) -> Tensor:
