@@ -219,4 +219,5 @@ def test_an_image_takes_the_memory_that_is_said(memory: int) -> None:
     image, image_said, rays_said, peak = map(int, numbers)
     assert scheme == "fused"
     assert image == image_said == 16 * 1200 * 1000
-    assert 0.5 * image < peak <= image + rays_said + 2**23
+    # 16 MiB for what the allocator and the threads take
+    assert 0.5 * image < peak <= image + rays_said + 2**24
