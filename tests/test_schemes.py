@@ -198,3 +198,15 @@ def test_fused_differentiates_like_direct(method):
             results.append(torch.autograd.grad(loss, (samples, at)))
         for got, want in zip(*results, strict=True):
             laws.assert_close(got, want, 1e-12)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_coefficients_that_are_changed_in_place_are_seen(turned):
+    """However they lie in memory: what is kept from call to call is never a copy of them."""
+    field, at = reconstruct(volume(), "triquadratic", scheme="fused"), points()
+    values = field.coefficients.values.clone()
+    values = values.transpose(0, 2).contiguous().transpose(0, 2) if turned else values
+    other = field.with_coefficients(replace(field.coefficients, values=values))
+    before = other(at)
+    values.mul_(2)
+    assert torch.equal(other(at), 2 * before)

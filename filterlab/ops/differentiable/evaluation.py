@@ -56,7 +56,9 @@ class Evaluation:
                 from filterlab.ops.cpu.evaluation import Evaluator  # it needs llvmlite
 
             parts = (self.coefficients, self.placement, self.stencil, self.start)
-            found = self._prepared[points.dtype] = Evaluator(*parts, points)
+            found = Evaluator(*parts, points)
+            if found.gather.coefficients.data_ptr() == self.coefficients.data_ptr():  # a copy could become outdated
+                self._prepared[points.dtype] = found
         return found
 
     def _compiled(self, points: Tensor) -> Placed:
