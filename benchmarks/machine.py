@@ -8,6 +8,8 @@ import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import torch
+
 from benchmarks.harness import usable_cores
 from benchmarks.peers import drjit_texture
 from benchmarks.records import Machine
@@ -15,6 +17,8 @@ from filterlab.ops.cpu.compiler import features
 
 _TOLD = ("sse4.2", "avx", "avx2", "fma", "f16c", "avx512f", "avx512vl", "avx512bw", "avx512dq", "neon", "sve")
 _PACKAGES = ("filterlab", "torch", "numpy", "llvmlite", "scipy", "torch-interpol", "drjit", "vtk")
+_ABSENT = "not installed"
+_OF_GPU = ("triton", "cupy-cuda12x", "cupy-cuda13x")
 
 
 def describe() -> Machine:
@@ -31,8 +35,10 @@ def describe() -> Machine:
         versions={
             "python": platform.python_version(),
             **{name: _version(name) for name in _PACKAGES},
+            **{name: v for name in _OF_GPU if torch.cuda.is_available() and (v := _version(name)) != _ABSENT},
             **({} if drjit_texture.missing() else {"LLVM of Dr.Jit": drjit_texture.llvm_version()}),
         },
+        gpu=torch.cuda.get_device_name() if torch.cuda.is_available() else "",
     )
 
 
@@ -53,4 +59,4 @@ def _version(package: str) -> str:
     try:
         return version(package)
     except PackageNotFoundError:
-        return "not installed"
+        return _ABSENT

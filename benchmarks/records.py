@@ -164,6 +164,7 @@ class Machine(Record):
     usable_cores: int
     system: str
     versions: dict[str, str]
+    gpu: str = ""
 
 
 class Report(Record):

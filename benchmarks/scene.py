@@ -18,6 +18,7 @@ from filterlab.fields.base import Field
 from filterlab.methods import reconstruct
 from filterlab.render import PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.dvr import prepare
+from filterlab.render.rays import intersect
 
 DIRECTION = (0.62, 0.77, -0.5)
 FIELD_OF_VIEW = 18.0  # degrees; with 30 the corners of the volume touch the edges of the image
@@ -74,12 +75,26 @@ class Scene:
 
     @property
     def _options(self) -> dict[str, Any]:
-        return {"size": (self.size, self.size), "step": self.step, "shading": self.shading}
+        return {
+            "size": (self.size, self.size),
+            "step": self.step,
+            "shading": self.shading,
+            "device": self.volume.device,
+        }
 
 
 def _transfer(table: Tensor) -> TransferFunction:
     positions = torch.linspace(0, 1, len(table), dtype=torch.float64)
     return TransferFunction(positions, table[:, :3].double(), table[:, 3].double())
+
+
+def entering_rays(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
+    """Where every ray enters, its direction, and its length inside (0 where it misses), voxel coordinates."""
+    field = scene.field("trilinear", "direct")
+    origins, directions = (r.reshape(-1, 3) for r in scene.camera.rays(scene.size, scene.size))
+    near, far = intersect(origins, directions, field.domain)
+    length = (far - near).clamp_min(0)
+    return origins + torch.where(length > 0, near, torch.zeros_like(near))[:, None] * directions, directions, length
 
 
 def marschner_lobb(n: int, size: int, **options: Any) -> Scene:

@@ -101,7 +101,8 @@ def _heading(report: Report) -> list[str]:
 def _machine(machine: Machine) -> str:
     features = " ".join(machine.features)
     cores = f"{machine.usable_cores} of {machine.cores} cores"
-    return f"{machine.cpu} ({machine.llvm_cpu}; {features}), {cores}, {machine.system}"
+    gpu = f", {machine.gpu}" if machine.gpu else ""
+    return f"{machine.cpu} ({machine.llvm_cpu}; {features}), {cores}, {machine.system}{gpu}"
 
 
 def _rounds(outcome: Outcome) -> str:

@@ -1,58 +1,245 @@
-"""On a GPU: the Triton sum against plain torch there, and against eight samples of the texture units."""
+"""On a GPU: Triton programs against plain torch there, against CuPy, and against the texture units.
+
+A call ends when the GPU has finished. Sizes are larger than elsewhere: what a thread does in a millisecond takes a GPU
+less time than Python needs to ask for it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from types import ModuleType
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from benchmarks import workloads
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item
-from benchmarks.peers import cupy_texture
+from benchmarks.peers import cupy_march, cupy_ndimage, cupy_texture
+from benchmarks.scene import Scene, blobs, marschner_lobb
 from benchmarks.settings import Settings
 from filterlab import ops
 from filterlab.kernels import bspline
+from filterlab.ops.differentiable.prefilter import prefilter_samples
+from filterlab.render import fused
+from filterlab.roots import first_root
+
+_POINTS = 16  # times as many as elsewhere
+_IMAGE = 4  # times the edge
+_FLOATS = 3 + 4  # of a point and of its rows
 
 
-def _race(settings: Settings, arrangement: str) -> Race:
-    """Triquadratic value and gradient; a call ends when the GPU has."""
-    what = f"triquadratic value + gradient on a GPU, points {arrangement}"
-    if not torch.cuda.is_available():
-        return Race(what, [], absent={"everything": "no GPU that torch can use"})
-    volume = workloads.noise(settings.voxels).cuda()
-    points = workloads.points(arrangement, settings.voxels, settings.points).cuda()
-    contestants = [
-        _contestant("fused", lambda: _jet(volume, points, "cuda"), len(points)),
-        _contestant("direct", lambda: _jet(volume, points, "reference"), len(points)),
-    ]
-    ratios, absent = [Ratio("fused", "direct")], {}
-    if why := cupy_texture.missing():
-        absent[cupy_texture.NAME] = why
-    else:
-        call = cupy_texture.triquadratic(volume, points)
-        contestants.append(_contestant(cupy_texture.NAME, call, len(points), computes=None))
-        ratios.append(Ratio("fused", cupy_texture.NAME))
-    return Race(what, contestants, ratios, absent=absent)
+def _on_gpu(what: str, build: Callable[[], Race]) -> Race:
+    if torch.cuda.is_available():
+        return build()
+    return Race(what, [], absent={"everything": "no GPU that torch can use"})
 
 
-def _jet(volume: Tensor, points: Tensor, implementation: str) -> Tensor:
-    return ops.jet(volume[None, None], points[None], bspline(2), 1, 0, implementation)[0, 0]
+def _finished(name: str, call: Callable[[], Any], computes: str | None, samples: int) -> Contestant:
+    """Whose call gives arrays, and ends when the GPU has."""
 
-
-def _contestant(
-    name: str, call: Callable[[], Tensor], samples: int, computes: str | None = "value and gradient"
-) -> Contestant:
-    def finished() -> Tensor:
-        rows = call()
+    def until_done() -> Any:
+        result = call()
         torch.cuda.synchronize()
-        return rows
+        return result
 
-    return Contestant(name, finished, computes, lambda rows: (rows[0], rows[1:]), samples)
-
-
-def _items(settings: Settings) -> list[Item]:
-    return [race_item(a, 2, lambda s, a=a: _race(s, a)) for a in workloads.ARRANGEMENTS]
+    return Contestant(name, until_done, computes, samples=samples)
 
 
-COMPARISON = Comparison("gpu", "on a GPU: the fused sum against plain torch and against the texture units", _items)
+def _with_peers(
+    race: Race, peers: Sequence[tuple[ModuleType, Callable[[], Contestant]]], above: Sequence[str] = ("fused",)
+) -> Race:
+    """The race with those peers that are there, and the contestants' ratios to them."""
+    contestants, ratios, absent = list(race.contestants), list(race.ratios), dict(race.absent)
+    for peer, make in peers:
+        if why := peer.missing():
+            absent[peer.NAME] = why
+        else:
+            contestants.append(make())
+            ratios += [Ratio(name, peer.NAME) for name in above]
+    return replace(race, contestants=contestants, ratios=ratios, absent=absent)
+
+
+# --- sums at points ---------------------------------------------------------------------------------------------------
+
+
+def _jets(settings: Settings, arrangement: str) -> Race:
+    """Also a copy within memory of as many bytes as points and rows have: nothing that reads and writes them is faster.
+
+    The texture units round the fractions of their samples to 8 bits: their numbers are not compared.
+    """
+    volume = workloads.noise(settings.voxels).cuda()
+    points = workloads.points(arrangement, settings.voxels, _POINTS * settings.points).cuda()
+    count = len(points)
+    block = points.new_empty(_FLOATS * count // 2)
+
+    def jet(implementation: str) -> tuple[Tensor, ...]:
+        rows = ops.jet(volume[None, None], points[None], bspline(2), 1, 0, implementation)[0, 0]
+        return rows[0], rows[1:]
+
+    contestants = [
+        _finished("fused", lambda: jet("cuda"), "value and gradient", count),
+        _finished("direct", lambda: jet("reference"), "value and gradient", count),
+        _finished("copy", lambda: (block.clone(),), None, count),
+    ]
+    race = Race(
+        f"triquadratic value + gradient, {count:,} points, {arrangement}",
+        contestants,
+        [Ratio("fused", "direct"), Ratio("fused", "copy")],
+    )
+
+    def textured() -> Contestant:
+        return _finished(cupy_texture.NAME, cupy_texture.triquadratic(volume, points), None, count)
+
+    return _with_peers(race, [(cupy_texture, textured)])
+
+
+def _splats(settings: Settings, arrangement: str) -> Race:
+    """The adjoint: rows of value and gradient to coefficients, by atomic additions."""
+    shape = (settings.voxels,) * 3
+    points = workloads.points(arrangement, settings.voxels, _POINTS * settings.points).cuda()
+    rows = torch.randn(1, 1, 4, len(points)).to(points)
+    volume = workloads.noise(settings.voxels).cuda()[None, None]
+    stencil = ops.Stencil.jet(bspline(2), 1)
+
+    def splat(implementation: str) -> tuple[Tensor]:
+        return (ops.splat(rows, points[None], bspline(2), 1, shape, 0, implementation),)
+
+    contestants = [
+        _finished("fused", lambda: splat("cuda"), "coefficients", len(points)),
+        _finished("direct", lambda: splat("reference"), "coefficients", len(points)),
+        _finished("gather", lambda: (ops.gather(volume, points[None], stencil, 0, "cuda"),), None, len(points)),
+    ]
+    what = f"triquadratic splat of value + gradient, {len(points):,} points, {arrangement}"
+    return Race(what, contestants, [Ratio("fused", "direct"), Ratio("fused", "gather")], tolerance=1e-4)
+
+
+# --- whole volumes ----------------------------------------------------------------------------------------------------
+
+
+def _prefilter(settings: Settings, name: str, order: int) -> Race:
+    n = settings.prefilter_voxels
+    samples = workloads.noise(n).cuda()
+    ours = _finished(
+        "plain torch", lambda: (prefilter_samples(samples, name, "mirror"),), "coefficients", samples.numel()
+    )
+    race = Race(f"{name} prefilter of {n}³ float32, boundary mirror", [ours], tolerance=5e-6)
+    peers = [(cupy_ndimage, lambda: cupy_ndimage.prefiltering(samples, order, "coefficients"))]
+    return _with_peers(race, peers, ["plain torch"])
+
+
+# --- images -----------------------------------------------------------------------------------------------------------
+
+
+def _scene(settings: Settings, edge: int = _IMAGE, build: Callable[..., Scene] = marschner_lobb) -> Scene:
+    scene = build(settings.image_voxels, settings.image * edge)
+    return replace(scene, volume=scene.volume.cuda())
+
+
+def _described(scene: Scene) -> str:
+    return (
+        f"image {scene.size}², volume {scene.volume.shape[-1]}³ float32, step {scene.step:g} voxel, lit, triquadratic"
+    )
+
+
+def _frame(scene: Scene, scheme: str, name: str | None = None) -> Contestant:
+    field = scene.field("triquadratic", scheme)
+
+    def call() -> tuple[Tensor]:
+        with torch.no_grad():
+            return (scene.image(field),)
+
+    return _finished(name or scheme, call, "triquadratic image", scene.size**2)
+
+
+def _march(settings: Settings) -> Race:
+    scene = _scene(settings)
+    race = Race(_described(scene), [_frame(scene, "fused")], tolerance=2e-2)
+    return _with_peers(race, [(cupy_march, lambda: cupy_march.marching_on_gpu(scene))])
+
+
+def _march_direct(settings: Settings) -> Race:
+    scene = _scene(settings, edge=1)
+    contestants = [_frame(scene, scheme) for scheme in ("fused", "direct")]
+    return Race(_described(scene), contestants, [Ratio("fused", "direct")], tolerance=5e-4)
+
+
+def _skipping(settings: Settings) -> Race:
+    """The same image, bit by bit."""
+    scene = _scene(settings, build=blobs)
+    skipping = _frame(scene, "fused", "skipping")
+
+    def everything() -> Any:
+        before, fused.SKIPPING = fused.SKIPPING, False
+        try:
+            return skipping.call()
+        finally:
+            fused.SKIPPING = before
+
+    contestants = [replace(skipping, name="not skipping", call=everything), skipping]
+    what = f"{_described(scene)}, 80 % of the bricks of 8³ voxels empty"
+    return Race(what, contestants, [Ratio("skipping", "not skipping")], tolerance=0.0)
+
+
+def _adjoint(settings: Settings, edge: int, schemes: Sequence[str]) -> Race:
+    """Gradients of the mean of an image to volume and transfer function.
+
+    In float32 rounding decides which interval of the table a sample is in, and derivatives by the volume jump from one
+    to the next: any float32 march is some thousandths of the largest from one in float64.
+    """
+    scene = _scene(settings, edge)
+    volume = scene.volume.clone().requires_grad_()
+    table = scene.table.clone().requires_grad_()
+
+    def both(scheme: str) -> tuple[Tensor, ...]:
+        image = scene.image(scene.field("triquadratic", scheme, volume), table)
+        return torch.autograd.grad(image.mean(), (volume, table))
+
+    contestants = [_frame(scene, "fused", "forward")]
+    contestants += [_finished(f"{s}, both ways", partial(both, s), "gradients", scene.size**2) for s in schemes]
+    ratios = [Ratio(f"{schemes[0]}, both ways", "forward")]
+    ratios += [Ratio(f"{schemes[0]}, both ways", f"{s}, both ways") for s in schemes[1:]]
+    return Race(f"{_described(scene)}: gradients to volume and table", contestants, ratios, tolerance=1e-2)
+
+
+# --- roots ------------------------------------------------------------------------------------------------------------
+
+
+def _roots(settings: Settings, dtype: torch.dtype) -> Race:
+    """First roots by plain torch, on the GPU and on the CPU."""
+    generator = torch.Generator().manual_seed(4)
+    c = (2 * torch.rand(4 * settings.points, 5, generator=generator, dtype=torch.float64) - 1).to(dtype)
+    there = c.cuda()
+    contestants = [
+        _finished("GPU", lambda: (first_root(there).nan_to_num(2.0, posinf=2.0),), None, len(c)),
+        Contestant("CPU, one thread", lambda: (first_root(c[: len(c) // 16]),), samples=len(c) // 16),
+    ]
+    return Race(f"first roots of {len(c):,} quartics, {str(dtype).removeprefix('torch.')}, plain torch", contestants)
+
+
+_ITEMS: dict[str, tuple[float, Callable[[Settings], Race]]] = {
+    **{f"jets-{a}": (5, partial(_jets, arrangement=a)) for a in workloads.ARRANGEMENTS},
+    **{f"splats-{a}": (5, partial(_splats, arrangement=a)) for a in workloads.ARRANGEMENTS},
+    "prefilter-quadratic": (5, partial(_prefilter, name="quadratic", order=2)),
+    "prefilter-cubic": (5, partial(_prefilter, name="cubic", order=3)),
+    "march": (5, _march),
+    "march-direct": (20, _march_direct),
+    "skipping": (5, _skipping),
+    "adjoint": (5, partial(_adjoint, edge=2, schemes=("fused",))),
+    "adjoint-direct": (20, lambda s: _adjoint(replace(s, image=s.image // 2), 1, ("fused", "direct"))),
+    "roots-float32": (10, partial(_roots, dtype=torch.float32)),
+    "roots-float64": (10, partial(_roots, dtype=torch.float64)),
+}
+
+
+def _item(name: str, seconds: float, build: Callable[[Settings], Race]) -> Item:
+    return race_item(name, seconds, lambda settings: _on_gpu(name, lambda: build(settings)))
+
+
+COMPARISON = Comparison(
+    "gpu",
+    "on a GPU: Triton programs against plain torch there, CuPy and the texture units",
+    lambda settings: [_item(name, *item) for name, item in _ITEMS.items()],
+)

@@ -20,16 +20,13 @@ from benchmarks.peers.task import without
 NAME = "eight trilinear, texture units"
 THREADS = 128  # of a block
 
-SOURCE = r"""
-extern "C" __global__ void triquadratic(cudaTextureObject_t volume, const float* points, float* rows, int count) {
-    int i = blockIdx.x * blockDim.x + threadIdx.x;
-    if (i >= count) return;
-    float at[3][2], weight[3][2];
+LIBRARY = r"""
+__device__ float4 jet(cudaTextureObject_t volume, float x, float y, float z) {  // value and gradient
+    float at[3][2], weight[3][2], point[3] = {x, y, z};
     for (int axis = 0; axis < 3; axis++) {
-        float x = points[3 * i + axis];
-        float beta = x - floorf(x + 0.5f);
-        at[axis][0] = x - (0.25f + 0.5f * beta) + 0.5f;  // texture coordinates: voxel centres are at halves
-        at[axis][1] = x + (0.25f - 0.5f * beta) + 0.5f;
+        float beta = point[axis] - floorf(point[axis] + 0.5f);
+        at[axis][0] = point[axis] - (0.25f + 0.5f * beta) + 0.5f;  // texture coordinates: voxel centres are at halves
+        at[axis][1] = point[axis] + (0.25f - 0.5f * beta) + 0.5f;
         weight[axis][0] = 0.5f - beta;
         weight[axis][1] = 0.5f + beta;
     }
@@ -49,12 +46,24 @@ extern "C" __global__ void triquadratic(cudaTextureObject_t volume, const float*
         dy += weight[2][k] * plane_dy;
         dz += (k ? 2 : -2) * plane;
     }
-    rows[i] = value;
-    rows[count + i] = dx;
-    rows[2 * count + i] = dy;
-    rows[3 * count + i] = dz;
+    return make_float4(value, dx, dy, dz);
 }
 """
+
+_SOURCE = (
+    LIBRARY
+    + r"""
+extern "C" __global__ void triquadratic(cudaTextureObject_t volume, const float* points, float* rows, int count) {
+    int i = blockIdx.x * blockDim.x + threadIdx.x;
+    if (i >= count) return;
+    float4 found = jet(volume, points[3 * i], points[3 * i + 1], points[3 * i + 2]);
+    rows[i] = found.x;
+    rows[count + i] = found.y;
+    rows[2 * count + i] = found.z;
+    rows[3 * count + i] = found.w;
+}
+"""
+)
 
 
 def missing() -> str | None:
@@ -70,8 +79,8 @@ def triquadratic(coefficients: Tensor, points: Tensor) -> Callable[[], Tensor]:
     """
     import cupy
 
-    texture = _texture(cupy, coefficients)
-    kernel = cupy.RawKernel(SOURCE, "triquadratic")
+    texture = texture_of(coefficients)
+    kernel = cupy.RawKernel(_SOURCE, "triquadratic")
     where, count = cupy.from_dlpack(points.contiguous()), len(points)
 
     def call() -> Tensor:
@@ -84,8 +93,10 @@ def triquadratic(coefficients: Tensor, points: Tensor) -> Callable[[], Tensor]:
     return call
 
 
-def _texture(cupy: Any, coefficients: Tensor) -> Any:
-    """A 3-D texture with linear filtering, clamped at its faces."""
+def texture_of(coefficients: Tensor) -> Any:
+    """A 3-D texture of (D, H, W) float32 with linear filtering, clamped at its faces."""
+    import cupy
+
     runtime, texture = cupy.cuda.runtime, cupy.cuda.texture
     depth, height, width = coefficients.shape
     channel = texture.ChannelFormatDescriptor(32, 0, 0, 0, runtime.cudaChannelFormatKindFloat)

@@ -10,13 +10,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 
 from benchmarks.harness import Contestant
 from benchmarks.peers.drjit_texture import missing, positions, started, texture_of
-from benchmarks.scene import LIGHTING, Scene
+from benchmarks.scene import LIGHTING, Scene, entering_rays
 from filterlab.ops.differentiable.prefilter import prefilter_samples
-from filterlab.render.rays import intersect
 
 __all__ = ["NAME", "marching", "missing"]
 
@@ -51,7 +49,7 @@ def _marcher(scene: Scene) -> Any:
     volume = texture_of(prefilter_samples(scene.volume, "cubic", "reflect"))
     rows = len(scene.table)
     table = Texture1f(TensorXf(np.ascontiguousarray(scene.table.numpy())), wrap_mode=dr.WrapMode.Clamp)
-    entry, direction, length = _rays(scene)
+    entry, direction, length = entering_rays(scene)
     start, ray, end = positions((entry + 0.5) / n), positions(direction), Float(length.float().numpy())
     dr.eval(end)
     rays = len(length)
@@ -83,12 +81,3 @@ def _marcher(scene: Scene) -> Any:
         return Array4f(light.x, light.y, light.z, 1 - transmittance)
 
     return march
-
-
-def _rays(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Where every ray enters, its direction, and its length inside (0 where it misses), voxel coordinates."""
-    field = scene.field("trilinear", "direct")
-    origins, directions = (r.reshape(-1, 3) for r in scene.camera.rays(scene.size, scene.size))
-    near, far = intersect(origins, directions, field.domain)
-    length = (far - near).clamp_min(0)
-    return origins + torch.where(length > 0, near, torch.zeros_like(near))[:, None] * directions, directions, length

@@ -18,6 +18,7 @@ from filterlab.kernels import PiecewisePolynomial, differentiate, horner
 from filterlab.ops.stencil import Product, Stencil
 
 CHUNK = 1 << 15  # points at a time: temporaries stay in cache and memory does not grow with M
+CHUNK_OF_GPU = 1 << 21  # enough for all of its cores
 
 
 def locate(x: Tensor, support: int, size: int, start: int) -> tuple[Tensor, Tensor]:
@@ -100,8 +101,9 @@ def _chunks(coefficient_shape: Sequence[int], points: Tensor) -> Iterator[tuple[
     n, m = points.shape[:2]
     flat = points.reshape(n * m, 3)
     volume = coefficient_shape[-1] * coefficient_shape[-2] * coefficient_shape[-3]
-    for start in range(0, n * m, CHUNK):
-        part = slice(start, min(start + CHUNK, n * m))
+    size = CHUNK_OF_GPU if points.device.type == "cuda" else CHUNK
+    for start in range(0, n * m, size):
+        part = slice(start, min(start + size, n * m))
         offset = 0 if n == 1 else torch.arange(part.start, part.stop, device=points.device) // m * volume
         yield part, flat[part], offset
 

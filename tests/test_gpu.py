@@ -1,0 +1,108 @@
+"""What people call, on a GPU against the CPU: nothing here runs where there is none. `tests/ops` has the programs."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("triton", reason="the package triton is not installed")
+
+from filterlab import reconstruct, resample
+from filterlab.methods import METHODS
+from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction, render
+from filterlab.roots import all_roots, first_root
+from filterlab.volume import Boundary, Volume
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU that torch can use")
+
+TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-11}
+BOUNDARIES = [str(b.value) for b in Boundary]
+CASES = [(method, scheme) for method, m in METHODS.items() for scheme in m.facts.schemes]
+
+
+def assert_same(on_gpu: Tensor, on_cpu: Tensor) -> None:
+    """In units of the largest magnitude."""
+    assert on_gpu.device.type == "cuda"
+    assert on_gpu.dtype == on_cpu.dtype
+    limit = TOLERANCE[on_cpu.dtype] * float(on_cpu.detach().abs().max() + 1e-30)
+    torch.testing.assert_close(on_gpu.cpu(), on_cpu, rtol=0, atol=limit)
+
+
+def samples(dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.rand((2, 3, 9, 8, 10), generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
+
+
+def points(dtype: torch.dtype = torch.float64) -> Tensor:
+    """Inside and outside of the volume."""
+    return torch.rand((2, 501, 3), generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(dtype) * 16 - 4
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+@pytest.mark.parametrize(("method", "scheme"), CASES)
+def test_values_gradients_and_derivatives(method: str, scheme: str, boundary: str) -> None:
+    """Of every method, in every way of evaluating it: value, gradient, and both derivatives of them."""
+    for dtype in TOLERANCE:
+        results = []
+        for device in ("cpu", "cuda"):
+            gradient = "central" if (method, scheme) == ("trilinear", "eight_trilinear") else None
+            x = samples(dtype).to(device).requires_grad_()
+            p = points(dtype).to(device).requires_grad_()
+            field = reconstruct(x, method, boundary=boundary, scheme=scheme, gradient=gradient)
+            jet = field.value_and_gradient(p)
+            weighed = jet[0].sin().sum() + jet[1].square().sum()
+            results.append((*jet, *torch.autograd.grad(weighed, (x, p))))
+        for of_cpu, of_gpu in zip(*results, strict=True):
+            assert_same(of_gpu, of_cpu)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_default_runs_there(method: str) -> None:
+    """Also without a copy of what is stored in fewer bytes."""
+    for storage in (None, "float16"):
+        fields = [reconstruct(samples().to(d), method, storage=storage) for d in ("cpu", "cuda")]
+        on_cpu, on_gpu = (field.jet(points().to(d), 1) for field, d in zip(fields, ("cpu", "cuda"), strict=True))
+        for of_cpu, of_gpu in zip(on_cpu, on_gpu, strict=True):
+            assert_same(of_gpu, of_cpu)
+
+
+def test_resampling() -> None:
+    volumes = [Volume(samples(torch.float32)[0, 0].to(d), spacing=(1.0, 2.0, 0.5)) for d in ("cpu", "cuda")]
+    on_cpu, on_gpu = (resample(v, "tricubic", shape=(13, 7, 9)).samples for v in volumes)
+    assert_same(on_gpu, on_cpu)
+
+
+def _image(device: str, method: str, scheme: str | None, dtype: torch.dtype) -> dict[str, Tensor]:
+    """An image and its derivatives by volume and transfer function."""
+    x = samples(dtype)[0, 0].to(device).requires_grad_()
+    options = {} if scheme is None else {"scheme": scheme}
+    field = reconstruct(Volume(x, spacing=(0.5, 1.0, 0.8)), method, **options)
+    camera = PerspectiveCamera.framing(field.domain, (0.4, 0.8, -0.45))
+    opacities = torch.tensor([0.01, 0.3, 0.1], dtype=dtype, device=device, requires_grad=True)
+    colors = [[0.2, 0.3, 0.9], [0.8, 0.5, 0.1], [0.4, 0.9, 0.3]]
+    transfer = TransferFunction([0.1, 0.4, 0.9], colors, opacities, unit=0.2)
+    shading = Shading((Light((1.0, -2.0, 1.0)), Light(None, (0.3, 0.4, 0.5))), ambient=0.3)
+    image = render(field, camera, transfer, size=(33, 21), shading=shading, dtype=dtype, device=device)
+    weights = torch.linspace(-0.3, 0.7, image.numel(), dtype=dtype, device=device).reshape(image.shape)
+    found = torch.autograd.grad((image * weights).sum(), (x, opacities))
+    return {"image": image, "volume": found[0], "opacities": found[1]}
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+@pytest.mark.parametrize("method", METHODS)
+def test_images_and_their_derivatives(method: str, dtype: torch.dtype) -> None:
+    expected = _image("cpu", method, None, dtype)
+    found = _image("cuda", method, None, dtype)
+    for name, x in expected.items():
+        limit = {torch.float32: 3e-4, torch.float64: 1e-10}[dtype] * float(x.detach().abs().max())
+        torch.testing.assert_close(found[name].cpu(), x, rtol=0, atol=limit, msg=lambda t, name=name: f"{name}: {t}")
+    assert expected["image"][..., 3].max() > 0.3
+
+
+@pytest.mark.parametrize("degree", range(1, 10))
+def test_roots(degree: int) -> None:
+    c = 2 * torch.rand((5000, degree + 1), generator=torch.Generator().manual_seed(degree), dtype=torch.float64) - 1
+    found, expected = first_root(c.cuda()).cpu(), first_root(c)
+    assert torch.equal(found.isfinite(), expected.isfinite())
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+    assert torch.equal(all_roots(c.cuda()).count.cpu(), all_roots(c).count)
