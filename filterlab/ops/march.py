@@ -65,8 +65,12 @@ class Transfer:
     @cached_property
     def steps(self) -> Steps | None:
         """Of control points at equal steps, or of buckets; None where comparing with every control point is as fast."""
-        positions = self.positions.detach()
-        return _equal_steps(positions) or _buckets(positions, self.opacities.detach())
+        return self.even or _buckets(self.positions.detach(), self.opacities.detach())
+
+    @cached_property
+    def even(self) -> Steps | None:
+        """Of control points at equal steps; None where they are not."""
+        return _equal_steps(self.positions.detach())
 
 
 @dataclass(frozen=True)
@@ -203,7 +207,7 @@ def _equal_steps(x: Tensor) -> Steps | None:
     if count < 1:
         return None
     scale = (count / (x[-1].double() - x[0].double())).to(x.dtype)
-    if not torch.equal((x - x[0]) * scale, torch.arange(count + 1, dtype=x.dtype)):
+    if not torch.equal((x - x[0]) * scale, torch.arange(count + 1, dtype=x.dtype, device=x.device)):
         return None
     return Steps(float(x[0]), float(scale), count)
 

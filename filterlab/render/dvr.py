@@ -39,6 +39,7 @@ Rays = tuple[Tensor, Tensor]
 Progress = bool | None | Callable[[int, int], None]
 
 _PART = 1 << 16  # rays that are cut at a time; more would only leave the caches
+_PART_OF_GPU = 1 << 20  # fewer would leave it waiting for Python
 _MOST_SEGMENTS = 2.0**62  # of a ray, that can be counted; no limit on the number of samples is as high
 _BYTES_PER_RAY = 256
 _BYTES_PER_RAY_SAVED = 2048  # of the fused marcher while autograd records
@@ -264,7 +265,8 @@ def _marcher(medium: Medium, memory: int) -> tuple[Marcher, int]:
     if why_not_fused(medium) is None:
         if medium.differentiable:  # derivatives by the volume are a volume for every part
             return FusedMarcher(memory), max(memory // _BYTES_PER_RAY_SAVED, 1)
-        return FusedMarcher(memory), max(min(memory // _BYTES_PER_RAY, _PART), 1)
+        most = _PART_OF_GPU if medium.transfer.positions.device.type == "cuda" else _PART
+        return FusedMarcher(memory), max(min(memory // _BYTES_PER_RAY, most), 1)
     at_once = rays_at_once(memory, medium.dtype, medium.differentiable)
     part = at_once if medium.differentiable else max(at_once, memory // (4 * _BYTES_PER_RAY))
     return PlainMarcher(memory), part

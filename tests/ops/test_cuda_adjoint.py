@@ -288,7 +288,8 @@ def test_compiles_for_a_gpu_that_need_not_be_there(
     monkeypatch.setenv("TRITON_INTERPRET", "0")
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
     derivatives, raised = stencil.derivatives
-    recipe = adjoint.Recipe(GRADIENTS, stencil.lowered, (derivatives.lowered, raised), lights, skipping=True)
+    slopes = (derivatives.lowered, raised)
+    recipe = adjoint.Recipe(GRADIENTS, stencil.lowered, slopes, lights, skipping=True, even=False)
     types = dict.fromkeys(segments.arrays_of(recipe), "*fp64")
     numbers = ("inner", "opacities", "colors", "shading", "view", "world", "coefficient_gradient")
     types |= dict.fromkeys(numbers, f"*{number}")

@@ -125,6 +125,26 @@ def test_any_number_of_control_points(points: int, device: str, monkeypatch: pyt
     assert images[0][1, :, 3].max() > 0.1
 
 
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+def test_a_table_of_equal_steps(dtype: torch.dtype, device: str) -> None:
+    """As look-up tables have: the interval is computed, also of values at its ends, beyond both, and of NaN."""
+    x, generator = torch.linspace(0.25, 0.75, 5, dtype=torch.float64), torch.Generator().manual_seed(5)
+    rgb, alpha = (torch.rand(5, *more, generator=generator, dtype=torch.float64) for more in ((3,), ()))
+    transfer = TransferFunction(x, rgb, alpha, 0.5)
+    samples = torch.randint(0, 9, (5, 6, 7), generator=generator).to(dtype) / 8
+    samples[2, 3, 3] = math.nan
+    read = []
+    field = reconstruct(samples, "trilinear", scheme="fused", nan="propagate")
+    scene = {"size": (6, 5), "dtype": dtype, "step": 1.0}
+    camera = OrthographicCamera.framing(field.domain, (0, 1, 0))  # samples are met exactly
+    shown = image(field, camera, transfer, device, lambda prepared: (read.append(prepared), prepared)[1], **scene)
+    assert all(prepared.transfer.even is not None for prepared in read)
+    plain = reconstruct(samples, "trilinear", scheme="direct", nan="propagate")
+    expected = render(plain, camera, transfer, **{**SCENE, **scene})
+    torch.testing.assert_close(shown, expected, rtol=0, atol=TOLERANCE[dtype], equal_nan=True)
+    assert 0 < shown.isnan().double().mean() < 0.5
+
+
 def test_faint_segments_have_no_weight(device: str) -> None:
     """As in the other fused march, which has the same rule for every segment, but ends rays pack by pack."""
     field = reconstruct(volume(), "trilinear", scheme="fused")
@@ -199,15 +219,15 @@ def test_compiles_for_a_gpu_that_need_not_be_there(monkeypatch: pytest.MonkeyPat
     types = dict.fromkeys(("coefficients", "inner", "opacities", "colors", "shading", "view", "world"), "*fp32")
     types |= dict.fromkeys(("entry", "direction", "length", "offset", "numbers", "light", "optical_depth"), "*fp64")
     types |= {"count": "*i64", "bricks": "*u8", "BLOCK": "constexpr"}
-    written = launch.launchable(compositing.Recipe(Stencil.jet(LINEAR, 1).lowered, 1, skipping=True).write())
+    written = launch.launchable(compositing.Recipe(Stencil.jet(LINEAR, 1).lowered, 1, skipping=True, even=True).write())
     source = ASTSource(written, {p.name: types.get(p.name, "i32") for p in written.params}, {"BLOCK": segments.BLOCK})
     made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})
     assert "bar.sync" not in made.asm["ptx"]  # one warp waits for nobody
 
 
 def test_what_a_scene_does_not_ask_for_is_not_computed() -> None:
-    unlit = str(compositing.Recipe(Stencil.jet(LINEAR, 0).lowered, None, skipping=False).write())
-    lit = str(compositing.Recipe(Stencil.jet(LINEAR, 1).lowered, 2, skipping=True).write())
+    unlit = str(compositing.Recipe(Stencil.jet(LINEAR, 0).lowered, None, skipping=False, even=False).write())
+    lit = str(compositing.Recipe(Stencil.jet(LINEAR, 1).lowered, 2, skipping=True, even=False).write())
     for word in ("row_1", "world", "view", "shading", "bricks +", "leap"):
         assert word in lit
         assert word not in unlit

@@ -14,8 +14,6 @@ Where derivatives go:
     table           a ray holds the sums of the interval it is in, and adds them to the interval's row atomically when
                     it leaves: values along a ray are alike, and all rays of an image share few rows. There are TABLES
                     tables, so that fewer programs meet at one, summed afterwards
-
-It was run in Triton's interpreter and compiled for GPUs, but not timed on one.
 """
 
 from __future__ import annotations
@@ -52,6 +50,7 @@ class Recipe:
     derivatives: tuple[Lowered, tuple[tuple[int, ...], ...]] | None
     lights: int | None
     skipping: bool
+    even: bool
     tables: int = TABLES
 
     @property
@@ -99,7 +98,7 @@ class _Adjoint(Program):
     def sample(self) -> None:
         tape = Tape(self.source)
         rows = self.rows(active=self.wants("coefficients") or self.wants("rays"))
-        located = optics.locate(tape, rows[0], self.wants("table"))
+        located = optics.locate(tape, rows[0], self.wants("table"), self.even)
         with self._if_it_counts(located):
             thickness = Node("thickness", self.wants("rays"))
             tau = optics.optical_depth(tape, optics.opacity(tape, located), thickness)

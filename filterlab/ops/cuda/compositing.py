@@ -2,13 +2,13 @@
 
 `segments` tells how rays are cut and go on (read it first). Of every sample then:
 
-    optics      opacity α by a binary search among the control points, optical depth τ (`ops.cuda.optics`)
+    optics      opacity α of the interval between control points, optical depth τ (`ops.cuda.optics`)
     compose     T = exp(−depth), weight w = T (1 − e^{−τ}); light += w · colour, depth += τ
 
 What no ray of the warp needs is not computed: colours and lights where all weights are 0. τ and w keep their digits for
 small α and τ, where log and exp alone would lose them.
 
-It was run in Triton's interpreter and compiled for GPUs, but not timed on one; double precision is slow on many.
+Rays are in double precision, which is slow on many GPUs that are not made for computing.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ class Recipe:
     stencil: Lowered
     lights: int | None
     skipping: bool
+    even: bool
     own = ("light", "optical_depth")
 
     def write(self) -> Source:
@@ -43,7 +44,7 @@ class _March(Program):
 
     def sample(self) -> None:
         tape, rows = Tape(self.source), self.rows(active=False)
-        located = optics.locate(tape, rows[0], active=False)
+        located = optics.locate(tape, rows[0], active=False, even=self.even)
         optics.optical_depth(tape, optics.opacity(tape, located), Node("thickness", active=False))
         self.weights()
         self.pass_on()

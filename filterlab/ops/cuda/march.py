@@ -18,7 +18,7 @@ from filterlab.ops.cuda import adjoint as backward
 from filterlab.ops.cuda import compositing, segments
 from filterlab.ops.cuda.launch import interpreting, launchable
 from filterlab.ops.cuda.segments import Recipe, arrays_of
-from filterlab.ops.march import March
+from filterlab.ops.march import March, Steps
 from filterlab.ops.march_derivatives import TABLE_ROW, by_name, columns_of_rays
 
 Report = Callable[[int], None]
@@ -29,7 +29,8 @@ def march(given: March, report: Report = lambda rays: None) -> tuple[Tensor, Ten
     rays = len(given.chords.count)
     light, depth = _zeros(given, rays, 3), _zeros(given, rays)
     if rays:
-        recipe = compositing.Recipe(given.stencil.lowered, given.lights, given.bricks is not None)
+        even = given.transfer.even is not None
+        recipe = compositing.Recipe(given.stencil.lowered, given.lights, given.bricks is not None, even)
         _launch(recipe, given, {"light": light, "optical_depth": depth})
         report(rays)
     return light, depth
@@ -61,8 +62,8 @@ def adjoint(
 def _recipe_of_adjoint(given: March, gradients: tuple[str, ...]) -> backward.Recipe:
     raised = given.stencil.derivatives if "rays" in gradients else None
     derivatives = None if raised is None else (raised[0].lowered, raised[1])
-    skipping = given.bricks is not None
-    return backward.Recipe(gradients, given.stencil.lowered, derivatives, given.lights, skipping, backward.TABLES)
+    skipping, even = given.bricks is not None, given.transfer.even is not None
+    return backward.Recipe(gradients, given.stencil.lowered, derivatives, given.lights, skipping, even, backward.TABLES)
 
 
 def _zeros(given: March, *shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -84,7 +85,9 @@ def _launch(recipe: Recipe, given: March, own: Mapping[str, Tensor]) -> None:
 
 def _numbers(given: March) -> Tensor:
     """In the order of `segments.NUMBERS`."""
-    numbers = (given.step, 1 / given.transfer.unit, given.opaque, given.slack, math.inf)
+    steps = given.transfer.even or Steps(0.0, 0.0, 1)
+    of_steps = (steps.low, steps.scale, steps.count - 1)
+    numbers = (given.step, 1 / given.transfer.unit, given.opaque, given.slack, math.inf, *of_steps)
     return torch.tensor(numbers, dtype=torch.float64, device=given.coefficients.device)
 
 

@@ -1,8 +1,9 @@
 """What a sample looks like: transfer function and shading, with their derivatives; the twin of `ops.cpu.optics`.
 
-Same letters and tables. Of the interval of a value a binary search among the inner control points is written. All
-functions write lines into the source of a tape; names that it must have: `inner`, `opacities`, `colors`, the tables;
-`inner_points`, `halvings`, integers; `infinity`; `arithmetic`, the dtype.
+Same letters and tables. The interval of a value is a step of an even table, as `Transfer.steps` says, or found by a
+binary search among the inner control points, each of whose loads waits for the one before. All functions write lines
+into the source of a tape; names that it must have: `inner`, `opacities`, `colors`, the tables; `inner_points`,
+`halvings`, integers; `low`, `scale`, `last` of the steps; `infinity`; `arithmetic`, the dtype.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from filterlab.ops.cuda.source import number
+from filterlab.ops.cuda.source import Source, number
 from filterlab.ops.cuda.tape import Node, Tape
 
 RGB = range(3)
@@ -35,23 +36,33 @@ class Located:
         return " | ".join(f"({end} != 0.0)" for end in self.ends[2:]) + f" | ({self.fraction} != {self.fraction})"
 
 
-def locate(tape: Tape, value: Node, active: bool) -> Located:
+def locate(tape: Tape, value: Node, active: bool, even: bool) -> Located:
     """A NaN is looked up in the first interval, where its fraction is NaN.
 
     Args:
         active: whether derivatives by the control points are asked; here and in `color_ends`.
+        even: whether the control points stand at equal steps.
     """
-    line = tape.source.line
-    line("interval = tl.full((BLOCK,), 0, tl.int64)")
-    with tape.source.block("for half in range(halvings)"):
-        line("further = interval + (tl.full((), 1, tl.int64) << (halvings - 1 - half))")
-        line("beyond = further <= inner_points")
-        line("control = tl.load(inner + further - 1, beyond, 0.0)")
-        line(f"interval = tl.where(beyond & ({value} >= control), further, interval)")
+    (_step_of if even else _search)(tape.source, value)
     ends = [_loaded(tape, f"end_{k}", f"opacities + 4 * interval + {k}", active) for k in range(4)]
     low, high, _, _ = ends
     share = tape.divide("share", tape.subtract("above", value, low), tape.subtract("width_of_interval", high, low))
     return Located(ends, tape.clamp_fraction("fraction", share))
+
+
+def _step_of(source: Source, value: Node) -> None:
+    source.line(f"steps = ({value} - low.to(arithmetic)) * scale.to(arithmetic)")
+    source.line("steps = tl.where(steps > 0.0, steps, 0.0)  # NaN too: no comparison with it is true")
+    source.line("interval = tl.where(steps < last.to(arithmetic), steps, last.to(arithmetic)).to(tl.int64)")
+
+
+def _search(source: Source, value: Node) -> None:
+    source.line("interval = tl.full((BLOCK,), 0, tl.int64)")
+    with source.block("for half in range(halvings)"):
+        source.line("further = interval + (tl.full((), 1, tl.int64) << (halvings - 1 - half))")
+        source.line("beyond = further <= inner_points")
+        source.line("control = tl.load(inner + further - 1, beyond, 0.0)")
+        source.line(f"interval = tl.where(beyond & ({value} >= control), further, interval)")
 
 
 def _loaded(tape: Tape, name: str, address: str, active: bool) -> Node:

@@ -31,7 +31,7 @@ WRITTEN_OUT = 8
 everything (triquadratic, two lights) took 12.6 s of one core, in loops 4.8 s, with the same loads and atomic additions
 in the machine code, where loops over three planes are written out again (Triton 3.7.1, for sm_80)."""
 
-NUMBERS = ("step", "per_unit", "opaque", "slack", "infinity")
+NUMBERS = ("step", "per_unit", "opaque", "slack", "infinity", "low", "scale", "last")
 """float64, in memory: Triton takes a number of Python for a float32."""
 SIZES = ("rays", "depth", "height", "width", "start", "halvings", "inner_points", "bricks_y", "bricks_x", "edge")
 
@@ -43,6 +43,7 @@ class Recipe(Protocol):
         stencil: value, and gradient when lit.
         lights: K; None: unlit.
         skipping: whether empty bricks are left out.
+        even: whether control points stand at equal steps.
         own: names of the arrays that only this program has.
     """
 
@@ -52,6 +53,8 @@ class Recipe(Protocol):
     def lights(self) -> int | None: ...
     @property
     def skipping(self) -> bool: ...
+    @property
+    def even(self) -> bool: ...
     @property
     def own(self) -> tuple[str, ...]: ...
     def write(self) -> Source: ...
@@ -76,7 +79,7 @@ class Program:
         self.source = Source(name, (*arrays_of(recipe), *SIZES, "BLOCK: tl.constexpr"))
         self.line = self.source.line
         self.taps = self.taps_of(recipe.stencil)
-        self.lights, self.skipping = recipe.lights, recipe.skipping
+        self.lights, self.skipping, self.even = recipe.lights, recipe.skipping, recipe.even
 
     def taps_of(self, stencil: Lowered) -> Taps:
         return Taps(self.source, stencil, WRITTEN_OUT)
