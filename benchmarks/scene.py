@@ -18,7 +18,8 @@ from filterlab.fields.base import Field
 from filterlab.methods import reconstruct
 from filterlab.render import PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.dvr import prepare
-from filterlab.render.rays import intersect
+from filterlab.render.rays import Region, spans
+from filterlab.render.sampling import Sampling
 
 DIRECTION = (0.62, 0.77, -0.5)
 FIELD_OF_VIEW = 18.0  # degrees; with 30 the corners of the volume touch the edges of the image
@@ -67,17 +68,17 @@ class Scene:
     def image(self, field: Field, table: Tensor | None = None, **options: Any) -> Tensor:
         """(size, size, 4) by filterlab's renderer; the field's scheme decides which marcher works."""
         transfer = self.transfer if table is None else _transfer(table)
-        return render(field, self.camera, transfer, **self._options, **options)
+        return render(field, self.camera, transfer, step=self.step, **self._seen, **options)
 
-    def samples(self, field: Field, **options: Any) -> int:
+    def samples(self, field: Field, region: Region | None = None, **options: Any) -> int:
         """Of all rays together, as the renderer counts them before it leaves any out."""
-        return prepare(field, self.camera, self.transfer, **self._options, **options).samples
+        sampling = Sampling(self.step, **options)
+        return prepare(field, self.camera, self.transfer, **self._seen, region=region, sampling=sampling).samples
 
     @property
-    def _options(self) -> dict[str, Any]:
+    def _seen(self) -> dict[str, Any]:
         return {
             "size": (self.size, self.size),
-            "step": self.step,
             "shading": self.shading,
             "device": self.volume.device,
         }
@@ -92,9 +93,7 @@ def entering_rays(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
     """Where every ray enters, its direction, and its length inside (0 where it misses), voxel coordinates."""
     field = scene.field("trilinear", "direct")
     origins, directions = (r.reshape(-1, 3) for r in scene.camera.rays(scene.size, scene.size))
-    near, far = intersect(origins, directions, field.domain)
-    length = (far - near).clamp_min(0)
-    return origins + torch.where(length > 0, near, torch.zeros_like(near))[:, None] * directions, directions, length
+    return spans(origins, directions, field.domain)
 
 
 def marschner_lobb(n: int, size: int, **options: Any) -> Scene:

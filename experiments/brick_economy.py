@@ -27,13 +27,14 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d
 
 import filterlab as fl
-from experiments.config import BoundaryName, SignalChoice, VolumeChoice
+from experiments.config import BoundaryName, VolumeChoice, check_signal
 from experiments.runs import Record, Run, Unit
 from experiments.timing import CLOCKS, TimedConfig, along_rays, quartile_record
 from filterlab.costs import Quartiles, per_round, take_turns
 from filterlab.fields.grid import GridField
 from filterlab.io.config import StrictModel
 from filterlab.render import OrthographicCamera, TransferFunction, render
+from filterlab.scenes.model import SignalModel
 
 CHEAP = "trilinear"
 
@@ -47,7 +48,7 @@ def _increasing(budgets: list[float]) -> list[float]:
 class Sampled(StrictModel):
     """A signal on n³ voxels."""
 
-    signal: SignalChoice
+    signal: SignalModel
     resolution: Annotated[int, Field(ge=4, le=512)]
 
 
@@ -91,7 +92,7 @@ def check(config: Config, path: str = "") -> None:
         if scan.present:
             scan.check(f"{path}scans[{i}]")
     for i, sampled in enumerate(config.signals):
-        sampled.signal.check(f"{path}signals[{i}].signal")
+        check_signal(sampled.signal, f"{path}signals[{i}].signal")
 
 
 def units(config: Config) -> list[Unit]:

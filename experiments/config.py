@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
-import inspect
 import math
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
@@ -18,11 +16,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 import filterlab as fl
 from filterlab import signals
 from filterlab.fields.base import Domain
-from filterlab.fields.storage import StorageName
-from filterlab.io import VolumeHeader, describe, load_volume
 from filterlab.io.config import ConfigError, Problem, StrictModel, load_config, unknown_name
 from filterlab.io.volumes import files_of
-from filterlab.render.scene import find_volume
+from filterlab.scenes.model import Reconstruction, SignalModel, VolumeFile
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
@@ -33,58 +29,37 @@ def _known_method(name: str) -> str:
     return name
 
 
-def _known_signal(name: str) -> str:
-    if name not in signals.SIGNALS:
-        raise ValueError(unknown_name("signal", name, signals.SIGNALS))
-    return name
-
-
 MethodName = Annotated[str, AfterValidator(_known_method)]
-SignalName = Annotated[str, AfterValidator(_known_signal)]
 Dtype = Literal["float32", "float64"]
 BoundaryName = Literal["mirror", "reflect", "wrap", "border", "zeros"]
 
 
-class Recipe(StrictModel):
-    """How a volume is reconstructed. A bare method name stands for its defaults; no scheme: the fastest that runs."""
-
-    method: MethodName
-    prefilter: bool = True
-    gradient: Literal["analytic", "central"] | None = None
-    scheme: Literal["direct", "fused", "eight_trilinear"] | None = None
-    sampler: Literal["exact", "texture_unit"] = "exact"
-    storage: StorageName | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_name(cls, value: Any) -> Any:
-        return {"method": value} if isinstance(value, str) else value
+class Recipe(Reconstruction):
+    """One of the reconstructions that an experiment compares. A bare method name stands for its defaults."""
 
     @model_validator(mode="after")
-    def _offered(self) -> Recipe:
-        method = fl.METHODS[self.method]
-        if not self.prefilter and not method.facts.prefiltered:
-            raise ValueError(f"{self.method} has no prefilter to leave out; remove prefilter: false")
-        method.scheme(self.scheme, self.gradient, self.sampler)
+    def _prefiltered(self) -> Recipe:
+        if not self.prefilter and not fl.METHODS[self.name].facts.prefiltered:
+            raise ValueError(f"{self.name} has no prefilter to leave out; remove prefilter: false")
         return self
 
     @property
     def gradient_kind(self) -> str:
         """`analytic` or `central`: what is used, the method's default where none is asked for."""
-        return self.gradient or fl.METHODS[self.method].gradients[0]
+        return self.gradient or fl.METHODS[self.name].gradients[0]
 
     @property
     def declared_order(self) -> int:
         """The approximation order that the method declares, with or without its prefilter."""
-        facts = fl.METHODS[self.method].facts
+        facts = fl.METHODS[self.name].facts
         return facts.approximation_order if self.prefilter else facts.approximation_order_without_prefilter
 
     @property
     def key(self) -> str:
         """A short unique name for records and files, e.g. `triquadratic+unprefiltered`."""
-        facts = fl.METHODS[self.method].facts
+        facts = fl.METHODS[self.name].facts
         parts = [
-            self.method,
+            self.name,
             "" if self.prefilter else "unprefiltered",
             "" if self.gradient_kind == facts.gradients[0] else self.gradient_kind,
             self.scheme or "",
@@ -93,30 +68,17 @@ class Recipe(StrictModel):
         ]
         return "+".join(p for p in parts if p)
 
-    def reconstruct(self, volume: fl.Volume, boundary: str = "mirror") -> fl.Field:
-        """The field of that recipe."""
-        return fl.reconstruct(
-            volume,
-            self.method,
-            boundary=boundary,
-            prefilter=self.prefilter,
-            gradient=self.gradient,
-            scheme=self.scheme,
-            sampler=self.sampler,
-            storage=self.storage,
-        )
-
     def record(self) -> dict[str, Any]:
         """What a record says about the recipe, so that a report needs nothing else to label it."""
         return {
             "recipe": self.key,
-            "method": self.method,
+            "method": self.name,
             "prefilter": self.prefilter,
             "gradient": self.gradient_kind,
             "scheme": self.scheme or "default",
             "sampler": self.sampler,
             "storage": self.storage or "default",
-            "default_gradient": self.gradient_kind == fl.METHODS[self.method].facts.gradients[0],
+            "default_gradient": self.gradient_kind == fl.METHODS[self.name].facts.gradients[0],
         }
 
 
@@ -133,72 +95,14 @@ def distinct(recipes: list[Recipe]) -> list[Recipe]:
 Recipes = Annotated[list[Recipe], Field(min_length=1), AfterValidator(distinct)]
 
 
-class SignalChoice(StrictModel):
-    """A signal by name, with its parameters. A bare name stands for the default parameters."""
-
-    name: SignalName
-    parameters: dict[str, float | list[float]] = Field(default_factory=dict)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_name(cls, value: Any) -> Any:
-        return {"name": value} if isinstance(value, str) else value
-
-    @model_validator(mode="after")
-    def _accepted(self) -> SignalChoice:
-        known = inspect.signature(signals.SIGNALS[self.name]).parameters
-        for name, value in self.parameters.items():
-            if name not in known:
-                raise ValueError(unknown_name(f"parameter of {self.name}", name, known))
-            vector = isinstance(known[name].default, tuple)
-            if isinstance(value, list) != vector or (isinstance(value, list) and len(value) != 3):
-                expected = "three numbers [x, y, z]" if vector else "a number"
-                raise ValueError(f"expected {expected} as {name}; got {value}")
-        self.build()
-        return self
-
-    def check(self, path: str) -> signals.Signal:
-        """The signal. Raises ConfigError, for the key at `path`, unless it is finite at a point like any other."""
-        told = f"expected parameters with which {self.name} has finite values; got {self.parameters}"
-        try:
-            signal = self.build()
-            point = torch.tensor([signal.domain.center], dtype=torch.float64) + 0.1 * signal.domain.voxel_size
-            found = signal.value_and_gradient(point)
-        except (ArithmeticError, RuntimeError, TypeError) as error:
-            raise ConfigError([Problem(self.label, path, f"{told} ({_first_line(error)})")]) from None
-        if not all(bool(x.isfinite().all()) for x in found):
-            raise ConfigError([Problem(self.label, path, told)])
-        return signal
-
-    def build(self) -> signals.Signal:
-        """The signal."""
-        parameters = {k: tuple(v) if isinstance(v, list) else v for k, v in self.parameters.items()}
-        return signals.named(self.name, **parameters)  # type: ignore[arg-type]
-
-    @property
-    def label(self) -> str:
-        """The name with its parameters, e.g. `gaussian (sigma 0.2)`."""
-        listed = ", ".join(f"{k} {v}" for k, v in self.parameters.items())
-        return f"{self.name} ({listed})" if listed else self.name
-
-
-class VolumeChoice(StrictModel):
-    """A volume file by name. A bare name stands for the file as it is.
+class VolumeChoice(VolumeFile):
+    """A volume file of an experiment.
 
     Attributes:
-        file: a path, a file in the folder of $FILTERLAB_VOLUMES, or `package:path` (see `volume_path`).
-        frame: which volume of a NIfTI time series; see `filterlab.load_volume`.
         optional: left out where there is no such file, by experiments that say so.
     """
 
-    file: Annotated[str, Field(min_length=1)]
-    frame: Annotated[int, Field(ge=0)] | None = None
     optional: bool = False
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_name(cls, value: Any) -> Any:
-        return {"file": value} if isinstance(value, str) else value
 
     def check(self, path: str) -> Domain:
         """The domain of the volume, by its header: no voxels are read.
@@ -206,9 +110,7 @@ class VolumeChoice(StrictModel):
         Raises ConfigError for the key at `path` unless the file is there with a sound header of one volume.
         """
         try:
-            header = self._header()
-            if len(header.shape) != 3:
-                raise ValueError(f"expected one volume (D, H, W); got {header.shape} in {header.path}")
+            header = self.header()
         except (ValueError, OSError) as error:
             raise ConfigError([Problem(self.file, path, str(error))]) from None
         return Domain.of_grid(header.size, header.geometry)
@@ -218,7 +120,7 @@ class VolumeChoice(StrictModel):
         """Whether it counts: it is there, or it has to be."""
         if self.optional:
             try:
-                volume_path(self.file)
+                self.path()
             except ValueError:
                 return False
         return True
@@ -226,17 +128,18 @@ class VolumeChoice(StrictModel):
     def extent(self) -> float:
         """Voxels along an axis, the geometric mean of the three; 128 where the file can't be read here."""
         try:
-            size = self._header().size
+            size = self.header().size
         except (ValueError, OSError):
             return 128.0
         return float(np.prod(np.asarray(size, dtype=np.float64)) ** (1 / 3))
 
-    def load(self) -> fl.Volume:
-        """The volume, with its geometry."""
-        return load_volume(volume_path(self.file), frame=self.frame)
 
-    def _header(self) -> VolumeHeader:
-        return describe(volume_path(self.file), frame=self.frame)
+def check_signal(signal: SignalModel, path: str) -> signals.Signal:
+    """The signal. Raises ConfigError, for the key at `path`, unless it is finite at a point like any other."""
+    try:
+        return signal.finite()
+    except ValueError as error:
+        raise ConfigError([Problem(signal.label, path, str(error))]) from None
 
 
 def input_files(config: BaseModel) -> dict[str, str]:
@@ -246,7 +149,7 @@ def input_files(config: BaseModel) -> dict[str, str]:
         ValueError, OSError: a file that is not there or can't be read.
     """
     present = (choice for choice in _volume_choices(config) if choice.present)
-    files = {file for choice in present for file in files_of(volume_path(choice.file))}
+    files = {file for choice in present for file in files_of(choice.path())}
     return {str(file): _digest(file) for file in sorted(files)}
 
 
@@ -288,30 +191,6 @@ def increasing(numbers: Iterable[int]) -> list[int]:
     if any(b <= a for a, b in pairwise(listed)):
         raise ValueError(f"expected increasing numbers; got {listed}")
     return listed
-
-
-def volume_path(name: str) -> Path:
-    """The file that `name` stands for: a path, a file in the folder of $FILTERLAB_VOLUMES, or `package:path`.
-
-    `package:path` is a file that comes with an installed Python package (`nibabel:tests/data/example4d.nii.gz`).
-
-    Raises:
-        ValueError: there is no such file; the message lists where it was looked for.
-    """
-    package, colon, inside = name.partition(":")
-    if colon and package.isidentifier():
-        return _packaged(package, inside)
-    return find_volume(name, Path())
-
-
-def _packaged(package: str, inside: str) -> Path:
-    spec = importlib.util.find_spec(package)
-    if spec is None or not spec.submodule_search_locations:
-        raise ValueError(f"expected the installed package {package!r}; it is not here (pip install {package})")
-    path = Path(spec.submodule_search_locations[0]) / inside
-    if not path.is_file():
-        raise ValueError(f"expected a file of the package {package}; it has no {inside!r}")
-    return path
 
 
 def known_configs(folder: Path = CONFIGS) -> dict[str, Path]:

@@ -22,7 +22,7 @@ from torch import Tensor
 from experiments.runs import Record, RunError
 from filterlab.io.atomic import atomic_write
 from filterlab.io.config import StrictModel
-from filterlab.render.scene import Positive
+from filterlab.scenes.model import Positive
 
 Parameters = dict[str, Tensor]
 

@@ -13,11 +13,12 @@ from pydantic import Field
 from torch import Tensor
 
 import filterlab as fl
-from experiments.config import BoundaryName, Dtype, ExperimentConfig, Recipe, Recipes, SignalChoice, number, torch_dtype
+from experiments.config import BoundaryName, Dtype, ExperimentConfig, Recipe, Recipes, check_signal, number, torch_dtype
 from experiments.runs import Record, Run, Unit, timed
 from experiments.views import View
 from filterlab import metrics
 from filterlab.io.images import to_srgb
+from filterlab.scenes.model import SignalModel
 
 TRUTH = "signal"
 
@@ -26,7 +27,7 @@ class Config(ExperimentConfig):
     """One signal at one resolution, rendered with every method."""
 
     experiment: Literal["dvr_signal"]
-    signal: SignalChoice
+    signal: SignalModel
     resolution: Annotated[int, Field(ge=2, le=1024)]
     methods: Recipes
     view: View
@@ -37,7 +38,7 @@ class Config(ExperimentConfig):
 
 def check(config: Config, path: str = "") -> None:
     """Raises ConfigError unless the images can be drawn and compared."""
-    config.signal.check(f"{path}signal")
+    check_signal(config.signal, f"{path}signal")
     config.view.check(_truth(config).domain, f"{path}view", compared=True)
 
 
@@ -74,7 +75,7 @@ def _image(config: Config, recipe: Recipe, run: Run) -> Record:
         f"volume:{config.resolution}",
         lambda: signal.sample(config.resolution, dtype=torch_dtype(config.dtype), device=config.device),
     )
-    field, building = timed(lambda: recipe.reconstruct(volume, config.boundary))
+    field, building = timed(lambda: recipe.build(volume, config.boundary))
     image, rendering = timed(lambda: config.view.draw(field, run, config.device, config.dtype))
     truth = run.memo("truth:", lambda: run.load_array(run.records[TRUTH]["array"]))
     files = {

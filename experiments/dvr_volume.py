@@ -86,4 +86,4 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
 
 def _field(config: Config, recipe: Recipe, run: Run):
     volume = run.memo("volume:", lambda: config.volume.load())
-    return recipe.reconstruct(volume.to(torch_dtype(config.dtype)).to(config.device), config.boundary)
+    return recipe.build(volume.to(torch_dtype(config.dtype)).to(config.device), config.boundary)

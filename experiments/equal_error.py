@@ -28,7 +28,7 @@ from experiments.config import (
     Dtype,
     Recipe,
     Recipes,
-    SignalChoice,
+    check_signal,
     increasing,
     torch_dtype,
 )
@@ -37,6 +37,7 @@ from experiments.runs import Record, Run, Unit
 from experiments.timing import CLOCKS, TimedConfig, along_rays, cost_record, ratio
 from filterlab.costs import measure
 from filterlab.io.config import StrictModel
+from filterlab.scenes.model import SignalModel
 
 Quantity = Literal["value", "gradient"]
 ORDERS: dict[Quantity, int] = {"value": 0, "gradient": 1}  # of the jets that are timed
@@ -47,7 +48,7 @@ Resolutions = Annotated[list[Resolution], Field(min_length=1), AfterValidator(in
 class Study(StrictModel):
     """One signal; points are drawn from its box shrunk to `inner`."""
 
-    signal: SignalChoice
+    signal: SignalModel
     inner: Annotated[float, Field(gt=0, le=1)] = 0.9
 
 
@@ -98,7 +99,7 @@ class Config(TimedConfig):
 def check(config: Config, path: str = "") -> None:
     """Raises ConfigError unless the signals can be evaluated."""
     for i, study in enumerate(config.studies):
-        study.signal.check(f"{path}studies[{i}].signal")
+        check_signal(study.signal, f"{path}studies[{i}].signal")
 
 
 def units(config: Config) -> list[Unit]:
@@ -154,7 +155,7 @@ def _measured(config: Config, index: int, recipe: Recipe, run: Run) -> Callable[
     @cache
     def errors(n: int) -> Record:
         volume = run.memo(f"volume:{index}/{n}", lambda: signal.sample(n, dtype=dtype, device=config.device))
-        return truth.errors(*evaluate(recipe.reconstruct(volume, config.boundary), truth.points))
+        return truth.errors(*evaluate(recipe.build(volume, config.boundary), truth.points))
 
     return errors
 
@@ -268,7 +269,7 @@ def _times(config: Config, index: str, comparison: Comparison, n: int, run: Run)
 
 
 def _builder(recipe: Recipe, volume: fl.Volume, boundary: str) -> Callable[[], fl.Field]:
-    return lambda: recipe.reconstruct(volume, boundary)
+    return lambda: recipe.build(volume, boundary)
 
 
 def _orders(config: Config, signal: fl.Field, n: int) -> dict[str, torch.Tensor]:

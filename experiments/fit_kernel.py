@@ -36,7 +36,7 @@ from experiments.runs import Record, Run, Unit
 from filterlab import prefilters
 from filterlab.io.config import ConfigError, Problem
 from filterlab.methods import tensor_product
-from filterlab.render.scene import Positive
+from filterlab.scenes.model import Positive
 from filterlab.spectrum import kernel_response
 
 AnyClass = Annotated[MarschnerLobbClass | WavesClass | ScanClass, Field(discriminator="kind")]
@@ -69,7 +69,7 @@ class Config(ExperimentConfig):
     classes: Annotated[list[AnyClass], Field(min_length=1)]
     candidates: Annotated[list[Candidate], Field(min_length=1), AfterValidator(distinct)]
     methods: Recipes
-    reference: Recipe = Recipe(method="triquadratic")
+    reference: Recipe = Recipe(name="triquadratic")
     gradient_weight: Annotated[float, Field(ge=0)] = 1.0
     resolution: Annotated[int, Field(ge=4, le=256)] = 24
     training: Count = 4
@@ -185,9 +185,9 @@ def _named(config: Config, index: int, run: Run) -> Record:
         "methods": [
             {
                 **recipe.record(),
-                "taps": fl.METHODS[recipe.method].facts.taps,
+                "taps": fl.METHODS[recipe.name].facts.taps,
                 **_facts(recipe),
-                "test": members.errors(recipe.reconstruct(members.volume, config.boundary)),
+                "test": members.errors(recipe.build(members.volume, config.boundary)),
             }
             for recipe in config.methods
         ],
@@ -196,7 +196,7 @@ def _named(config: Config, index: int, run: Run) -> Record:
 
 def _facts(recipe: Recipe) -> Record:
     """What the prefilter of a named method costs, and the measures of the whole, where it is separable."""
-    if (method := tensor_product(recipe.method)) is None:
+    if (method := tensor_product(recipe.name)) is None:
         return {}
     used = method.prefilter if recipe.prefilter else prefilters.IDENTITY
     measures = fir.measures(method.kernel, used.response) if method.terms is None else {}

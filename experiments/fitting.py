@@ -146,7 +146,7 @@ class Objective:
     def of(cls, members: Members, boundary: str, weight: float, recipe: Recipe) -> Objective:
         """Raises ValueError where the named method makes no error that others could be compared with."""
         with torch.no_grad():
-            value, gradient = members.mean_squares(recipe.reconstruct(members.volume, boundary))
+            value, gradient = members.mean_squares(recipe.build(members.volume, boundary))
         if not (value > 0 and gradient > 0):
             raise ValueError(f"expected members that {recipe.key} is not exact for; got errors {value}, {gradient}")
         return cls(members, boundary, weight, (float(value), float(gradient)))

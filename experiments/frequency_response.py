@@ -61,7 +61,7 @@ def units(config: Config) -> list[Unit]:
 
 def _seconds(recipe: Recipe, config: Config) -> float:
     """The measures of ncrsi, whose kernel is not separable, are integrals over a volume of frequencies."""
-    return 20.0 if recipe.method == "ncrsi" and 3 in config.dimensions else 0.2
+    return 20.0 if recipe.name == "ncrsi" and 3 in config.dimensions else 0.2
 
 
 def compute(config: Config, unit: Unit, run: Run) -> Record:
@@ -76,7 +76,7 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
         "measured": run.save_array(f"{recipe.key}-measured", measured),
     }
     found = {"at_nyquist": number(_measured(recipe, closed_at.new_tensor([math.pi]))[0]), "largest_difference": None}
-    if tensor_product(recipe.method) is not None:
+    if tensor_product(recipe.name) is not None:
         files["closed"] = run.save_array(f"{recipe.key}-closed", _closed(recipe, closed_at))
         found["at_nyquist"] = number(_closed(recipe, closed_at.new_tensor([math.pi]))[0])
         found["largest_difference"] = number((measured - _closed(recipe, measured_at)).abs().max())
@@ -90,20 +90,20 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
 
 
 def _closed(recipe: Recipe, omega: torch.Tensor) -> torch.Tensor:
-    return spectrum.axis_response(recipe.method, omega, prefilter=recipe.prefilter)
+    return spectrum.axis_response(recipe.name, omega, prefilter=recipe.prefilter)
 
 
 def _measured(recipe: Recipe, omega: torch.Tensor) -> torch.Tensor:
-    return spectrum.measured_response(recipe.method, omega, prefilter=recipe.prefilter, scheme=recipe.scheme)
+    return spectrum.measured_response(recipe.name, omega, prefilter=recipe.prefilter, scheme=recipe.scheme)
 
 
 def _measures(recipe: Recipe, dimensions: Sequence[int]) -> list[tuple[str, int, float | None]]:
     """Smoothing and postaliasing; None of a method whose response is measured only."""
 
     def measured(measure: Callable[..., float], d: int) -> float | None:
-        if tensor_product(recipe.method) is None:
+        if tensor_product(recipe.name) is None:
             return None
-        return number(measure(recipe.method, prefilter=recipe.prefilter, dimensions=d))
+        return number(measure(recipe.name, prefilter=recipe.prefilter, dimensions=d))
 
     measures = (("smoothing", spectrum.smoothing), ("postaliasing", spectrum.postaliasing))
     return [(name, d, measured(measure, d)) for name, measure in measures for d in dimensions]

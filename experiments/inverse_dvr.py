@@ -22,7 +22,7 @@ from experiments.config import (
     Dtype,
     ExperimentConfig,
     Recipes,
-    SignalChoice,
+    check_signal,
     increasing,
     number,
     torch_dtype,
@@ -41,8 +41,9 @@ from experiments.recovery import (
 from experiments.runs import Record, Run, Unit
 from experiments.views import MAX_SAMPLES
 from filterlab.io.config import ConfigError, Problem
-from filterlab.render import scene
 from filterlab.render.transfer import TransferFunction
+from filterlab.scenes import model as scene
+from filterlab.scenes.model import SignalModel
 
 VOLUME, TRANSFER = "volume", "transfer"
 GROUPS = 10  # of voxels, by how strongly the images depend on them
@@ -63,7 +64,7 @@ class Config(ExperimentConfig):
     """
 
     experiment: Literal["inverse_dvr"]
-    signal: SignalChoice
+    signal: SignalModel
     resolution: Annotated[int, Field(ge=2, le=512)]
     methods: Recipes
     images_of: Literal["signal", "samples"] = "signal"
@@ -107,7 +108,7 @@ class Config(ExperimentConfig):
 
 def check(config: Config, path: str = "") -> None:
     """Raises ConfigError unless signal, methods and images can be computed here."""
-    config.signal.check(f"{path}signal")
+    check_signal(config.signal, f"{path}signal")
     for key, transfer in config.transfers.items():
         if transfer.axis != "raw":
             message = "expected raw, so that images of the signal and of every volume share the values"
@@ -117,7 +118,7 @@ def check(config: Config, path: str = "") -> None:
             raise ConfigError([Problem("the transfer function", f"{path}{key}", message)])
     for i, recipe in enumerate(config.methods):
         try:
-            recipe.reconstruct(fl.Volume(torch.zeros(2, 2, 2, dtype=torch_dtype(config.dtype))), config.boundary)
+            recipe.build(fl.Volume(torch.zeros(2, 2, 2, dtype=torch_dtype(config.dtype))), config.boundary)
         except ValueError as error:
             raise ConfigError([Problem(recipe.key, f"{path}methods[{i}]", str(error))]) from None
     views = config.views

@@ -30,10 +30,10 @@ from experiments.views import MAX_SAMPLES
 from filterlab import metrics
 from filterlab.fields.base import Domain
 from filterlab.io.config import StrictModel
-from filterlab.render import scene
 from filterlab.render.camera import Camera
 from filterlab.render.dvr import render
 from filterlab.render.transfer import TransferFunction
+from filterlab.scenes import model as scene
 from filterlab.signals import Signal
 from filterlab.volume import Geometry
 
@@ -85,7 +85,9 @@ class Views(StrictModel):
 
     def _camera(self, domain: Domain, direction: tuple[float, float, float]) -> Camera:
         up = (0.0, 1.0, 0.0) if abs(direction[2]) > 0.9 else (0.0, 0.0, 1.0)
-        view = scene.View(projection=self.projection, direction=direction, up=up, field_of_view=self.field_of_view)
+        view = scene.CameraView(
+            projection=self.projection, direction=direction, up=up, field_of_view=self.field_of_view
+        )
         return view.build(domain, (self.size, self.size))
 
 
@@ -169,7 +171,7 @@ class Bench:
     def field(self, voxels: Tensor) -> fl.Field:
         """The field of voxels `(n', n', n')` that fill the signal's box, for any n'."""
         geometry = _geometry(self.signal.domain, len(voxels))
-        return self.recipe.reconstruct(fl.Volume.with_geometry(voxels, geometry), self.boundary)
+        return self.recipe.build(fl.Volume.with_geometry(voxels, geometry), self.boundary)
 
     @property
     def target(self) -> fl.Field:

@@ -24,7 +24,7 @@ from experiments.config import (
     ExperimentConfig,
     Recipe,
     Recipes,
-    SignalChoice,
+    check_signal,
     increasing,
     number,
     torch_dtype,
@@ -32,6 +32,7 @@ from experiments.config import (
 from experiments.runs import Record, Run, Unit, timed
 from filterlab import metrics
 from filterlab.io.config import StrictModel
+from filterlab.scenes.model import SignalModel
 from filterlab.signals import Signal
 
 CHUNK = 2**14
@@ -48,7 +49,7 @@ class Study(StrictModel):
         inner: points are drawn from the box shrunk to this fraction about its centre, away from its ends.
     """
 
-    signal: SignalChoice
+    signal: SignalModel
     resolutions: Annotated[list[Annotated[int, Field(ge=1, le=1024)]], Field(min_length=1), AfterValidator(increasing)]
     fit_from: Annotated[int, Field(ge=1)] | None = None
     inner: Annotated[float, Field(gt=0, le=1)] = 0.9
@@ -79,7 +80,7 @@ class Config(ExperimentConfig):
 def check(config: Config, path: str = "") -> None:
     """Raises ConfigError unless the signals can be evaluated."""
     for i, study in enumerate(config.studies):
-        study.signal.check(f"{path}studies[{i}].signal")
+        check_signal(study.signal, f"{path}studies[{i}].signal")
 
 
 def units(config: Config) -> list[Unit]:
@@ -116,7 +117,7 @@ def _error(config: Config, study: Study, index: str, n: int, recipe: Recipe, run
     truth = run.memo(f"truth:{index}", lambda: _truth(config, study))
     dtype = torch_dtype(config.dtype)
     volume = run.memo(f"volume:{index}/{n}", lambda: signal.sample(n, dtype=dtype, device=config.device))
-    field, building = timed(lambda: recipe.reconstruct(volume, config.boundary))
+    field, building = timed(lambda: recipe.build(volume, config.boundary))
     (v, g), evaluating = timed(lambda: evaluate(field, truth.points))
     return {
         "voxel_size": 1.0 / n,

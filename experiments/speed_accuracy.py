@@ -24,7 +24,7 @@ from experiments.config import (
     Dtype,
     Recipe,
     Recipes,
-    SignalChoice,
+    check_signal,
     increasing,
     torch_dtype,
 )
@@ -36,6 +36,7 @@ from experiments.timing import CLOCKS, TimedConfig, along_rays, cost_record, qua
 from experiments.views import Silent, View
 from filterlab.costs import Quartiles, measure, take_turns
 from filterlab.io.config import StrictModel
+from filterlab.scenes.model import SignalModel
 
 WORK: dict[str, tuple[str, int]] = {  # name -> where the points lie, order of the jet
     "value-rays": ("rays", 0),
@@ -58,7 +59,7 @@ class Variant(StrictModel):
     def of(self, recipe: Recipe) -> Candidate | None:
         """The recipe evaluated so; None where the method does not offer the scheme with that kind of gradient."""
         try:
-            fl.METHODS[recipe.method].scheme(self.scheme, recipe.gradient, self.sampler)
+            fl.METHODS[recipe.name].scheme(self.scheme, recipe.gradient, self.sampler)
         except ValueError:
             return None
         changes = {"scheme": self.scheme, "sampler": self.sampler, "storage": self.storage}
@@ -77,7 +78,7 @@ class Candidate:
         return self.recipe.key if self.variant.dtype == "float32" else f"{self.recipe.key}+in_{self.variant.dtype}"
 
     def field(self, volume: fl.Volume, boundary: str) -> fl.Field:
-        return self.recipe.reconstruct(volume.to(torch_dtype(self.variant.dtype)), boundary)
+        return self.recipe.build(volume.to(torch_dtype(self.variant.dtype)), boundary)
 
     def record(self) -> Record:
         return {**self.recipe.record(), "candidate": self.key, "variant": self.variant.name}
@@ -86,7 +87,7 @@ class Candidate:
 class Source(StrictModel):
     """A signal, the part of its box that points are drawn from, and a view where images are compared."""
 
-    signal: SignalChoice
+    signal: SignalModel
     inner: Annotated[float, Field(gt=0, le=1)] = 0.9
     view: View | None = None
 
@@ -154,7 +155,7 @@ class Config(TimedConfig):
 def check(config: Config, path: str = "") -> None:
     """Raises ConfigError unless the signals can be evaluated, drawn and compared."""
     for i, source in enumerate(config.sources):
-        source.signal.check(f"{path}sources[{i}].signal")
+        check_signal(source.signal, f"{path}sources[{i}].signal")
         if source.view is not None and config.images:
             _fine(config, source).check(_signal(config, source).domain, f"{path}sources[{i}].view", compared=True)
 
@@ -278,7 +279,7 @@ def _images(config: Config, index: int, study: str, n: str, run: Run) -> Record:
     truth = run.memo(f"image:{index}", lambda: run.load_array(run.records[f"truth/{index}"]["array"]))
     calls, entries, files = {}, [], []
     for recipe in chosen.methods:
-        field = recipe.reconstruct(volume, config.boundary)
+        field = recipe.build(volume, config.boundary)
         for step in chosen.steps:
             calls[f"{recipe.key}@{step:g}"] = draw = _drawing(config, source, field, step)
             image = draw()

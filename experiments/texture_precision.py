@@ -26,8 +26,8 @@ from experiments.config import (
     ExperimentConfig,
     Recipe,
     Recipes,
-    SignalChoice,
     VolumeChoice,
+    check_signal,
     distinct,
     number,
 )
@@ -38,6 +38,7 @@ from experiments.views import View
 from filterlab import metrics
 from filterlab.fields.base import Domain
 from filterlab.io.config import StrictModel
+from filterlab.scenes.model import SignalModel
 
 VARIANTS: dict[str, tuple[torch.dtype, str, str]] = {
     "float64 eight samples": (torch.float64, "eight_trilinear", "exact"),
@@ -51,7 +52,7 @@ class Source(StrictModel):
     """What is reconstructed: a signal at a resolution, or a volume file; and a view, if images are to be compared."""
 
     title: str
-    signal: SignalChoice | None = None
+    signal: SignalModel | None = None
     resolution: Annotated[int, Field(ge=2, le=1024)] | None = None
     volume: VolumeChoice | None = None
     view: View | None = None
@@ -74,7 +75,7 @@ class Source(StrictModel):
             return self.volume.check(f"{path}.volume")
         assert self.signal is not None
         assert self.resolution is not None
-        domain = self.signal.check(f"{path}.signal").domain
+        domain = check_signal(self.signal, f"{path}.signal").domain
         extent = max(b - a for a, b in zip(domain.lower, domain.upper, strict=True))
         return replace(domain, voxel_size=extent / self.resolution)
 
@@ -107,9 +108,9 @@ class Config(ExperimentConfig):
         for recipe in [*self.methods, *self.image_methods]:
             if (recipe.scheme, recipe.sampler) != (None, "exact"):
                 raise ValueError(f"{recipe.key}: every scheme and sampler is measured; leave them out")
-            if "eight_trilinear" not in fl.METHODS[recipe.method].facts.schemes:
+            if "eight_trilinear" not in fl.METHODS[recipe.name].facts.schemes:
                 offering = [m for m, method in fl.METHODS.items() if "eight_trilinear" in method.facts.schemes]
-                raise ValueError(f"{recipe.method} offers no scheme eight_trilinear; {', '.join(offering)} do")
+                raise ValueError(f"{recipe.name} offers no scheme eight_trilinear; {', '.join(offering)} do")
             _variant(recipe, "eight_trilinear", "exact")
         return self
 
@@ -150,12 +151,12 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
 
 def _variant(recipe: Recipe, scheme: Any, sampler: Any) -> Recipe:
     """The recipe with another scheme. Raises ValueError for a kind of gradient that the scheme does not give."""
-    fl.METHODS[recipe.method].scheme(scheme, recipe.gradient, sampler)
+    fl.METHODS[recipe.name].scheme(scheme, recipe.gradient, sampler)
     return recipe.model_copy(update={"scheme": scheme, "sampler": sampler})
 
 
 def _precision(config: Config, source: Source, volume: fl.Volume, recipe: Recipe) -> Record:
-    reference = recipe.reconstruct(volume, config.boundary)
+    reference = recipe.build(volume, config.boundary)
     # points that float32 holds exactly, so that every variant is asked at the same ones
     points = uniform_points(reference, config.points, config.inner, config.seed, torch.float32, config.device).double()
     value, gradient = evaluate(reference, points)
@@ -165,7 +166,7 @@ def _precision(config: Config, source: Source, volume: fl.Volume, recipe: Recipe
         raise RunError(f"{source.title}: expected samples that vary; all are {float(volume.samples.max())}")
     variants = {}
     for variant, (dtype, scheme, sampler) in VARIANTS.items():
-        field = _variant(recipe, scheme, sampler).reconstruct(volume.to(dtype), config.boundary)
+        field = _variant(recipe, scheme, sampler).build(volume.to(dtype), config.boundary)
         v, g = (t.double() for t in evaluate(field, points.to(dtype)))
         variants[variant] = _errors(v, value, scale) | _gradient_errors(g, gradient, length)
     record: Record = {"variants": variants, "range": scale, "gradient_length": length, "points": config.points}
@@ -194,7 +195,7 @@ def _images(config: Config, source: Source, volume: fl.Volume, recipe: Recipe, r
     assert source.view is not None
     single = volume.to(torch.float32)
     fields = [
-        _variant(recipe, "eight_trilinear", sampler).reconstruct(single, config.boundary)
+        _variant(recipe, "eight_trilinear", sampler).build(single, config.boundary)
         for sampler in ("exact", "texture_unit")
     ]
     exact, rounded = (source.view.draw(field, run, config.device, "float32") for field in fields)

@@ -1,4 +1,4 @@
-"""A view: everything an image needs but the field. Its sections are those of scene files (`filterlab.render.scene`)."""
+"""A view: everything an image needs but the field. Its sections are those of scene files (`filterlab.scenes.model`)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import filterlab as fl
 from experiments.config import Dtype, torch_dtype
 from filterlab.fields.base import Domain
 from filterlab.io.config import ConfigError, Problem, StrictModel
-from filterlab.render import scene
 from filterlab.render.dvr import render
-from filterlab.render.rays import intersect, segment_count
+from filterlab.render.rays import segment_count, spans
+from filterlab.scenes import model as scene
 
 SECONDS_PER_SAMPLE = {"fused": 1e-8, "plain": 3e-7}
 """Of the marchers, on one core and on two, for views that are mostly empty; only expectations use it.
@@ -62,7 +62,7 @@ class View(StrictModel):
 
     size: tuple[scene.Pixels, scene.Pixels] = (512, 512)
     step: scene.Positive = 0.5
-    camera: scene.View = scene.View()
+    camera: scene.CameraView = scene.CameraView()
     transfer: scene.Transfer
     lighting: scene.Lighting | None = None
     region: scene.Region | None = None
@@ -110,8 +110,8 @@ class View(StrictModel):
         width, height = (max(round(scale * n), 1) for n in self.size)
         camera = self.camera.build(domain, self.size)
         origins, directions = camera.pixel_rays(torch.arange(width * height), width, height)
-        near, far = intersect(origins, directions, domain, self.region.build() if self.region else None)
-        count = segment_count((far - near).clamp_min(0), self.step * domain.voxel_size).sum()
+        inside = spans(origins, directions, domain, self.region.build() if self.region else None)
+        count = segment_count(inside.length, self.step * domain.voxel_size).sum()
         return float(count) * (self.size[0] * self.size[1]) / (width * height)
 
     def seconds(self, voxels: float, scheme: str | None) -> float:

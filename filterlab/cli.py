@@ -68,21 +68,21 @@ class Render:
         if self.output is not None:
             self._check_output(self.output)
 
-        from filterlab.render.scene import load_scene
+        from filterlab.scenes.build import load_scene
 
         scene = load_scene(self.scene, overrides)
         if scene.volume is not None and self.output is not None:
             _check_not_input(self.output, Path(scene.volume.file))
         _check_device(scene.device)
         if self.output is None:
-            from filterlab.render.plan import plan
-            from filterlab.render.plan_report import table
-            from filterlab.render.scene import build
+            from filterlab.scenes.build import build
+            from filterlab.scenes.plan import plan
+            from filterlab.scenes.plan_report import table
 
             _show(table(plan(build(scene))))
             return
         from filterlab.io.images import save_image
-        from filterlab.render.scene import render_scene
+        from filterlab.scenes.build import render_scene
 
         save_image(render_scene(scene, progress=None), self.output)
 
@@ -395,7 +395,7 @@ def _progress_bar() -> Iterator[Callable[[float, str], None]]:
 def _check_scene(path: Path, content: dict[str, Any]) -> str:
     """A scene as YAML. Raises ValueError for what `filterlab render` would refuse, or no file can hold."""
     from filterlab.io.config import dump_data, loads_config
-    from filterlab.render.scene import Scene
+    from filterlab.scenes.model import Scene
 
     try:
         content["volume"].encode()

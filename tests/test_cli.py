@@ -416,7 +416,7 @@ def test_render_refuses_before_it_works(
     def never(*_: object, **__: object) -> None:
         pytest.fail("nothing must be rendered")
 
-    monkeypatch.setattr("filterlab.render.scene.render_scene", never)
+    monkeypatch.setattr("filterlab.scenes.build.render_scene", never)
     out = tmp_path / "a.png"
     fails(capsys, ["render", scene_file, "-o", out, "--method", "noch"], 1, "did you mean 'notch'?", "tricubic")
     fails(capsys, ["render", scene_file, "-o", out, "--camera.fov", "3"], 1, "--camera.fov: camera.fov: unknown key")

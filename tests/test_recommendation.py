@@ -19,7 +19,7 @@ from filterlab.recommendation.choice import IMAGE, Question, _marched, choose
 from filterlab.recommendation.errors import Distance, Yardstick
 from filterlab.recommendation.survey import inner_box
 from filterlab.recommendation.ways import WayCost
-from filterlab.render.scene import Scene
+from filterlab.scenes.model import Scene
 from filterlab.signals import Signal
 
 FAST = {"seconds": 0.05}

@@ -11,7 +11,7 @@ from experiments.config import known_configs, load_heading
 from experiments.extremes.contract import Case, Finding, Subject, Tally
 from experiments.extremes.mutations import edited, random_edits
 from filterlab.io.config import MAX_BYTES, ConfigError, StrictModel, loads_config
-from filterlab.render.scene import Scene
+from filterlab.scenes.model import Scene
 
 _SECONDS = 20.0
 

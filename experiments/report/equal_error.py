@@ -27,7 +27,7 @@ def draw(config: Config, records: Mapping[str, Record], _folder: Path) -> Sectio
 
 
 def _lead(config: Config) -> list[str]:
-    usual = " and ".join(f"{c.usual.method} for the {c.quantity}" for c in config.comparisons)
+    usual = " and ".join(f"{c.usual.name} for the {c.quantity}" for c in config.comparisons)
     return [
         f"A volume may be smaller where its reconstruction is better. The usual one ({usual}) is measured at some n³; "
         "for every other method the least m³ is sought at which its RMS error is no larger. Fields of these sizes then "
@@ -123,7 +123,7 @@ def _curves(config: Config, index: int, comparison: Comparison, searches: Sequen
             else:
                 plots.logarithmic(axes)
             plots.resolution_axis(axes, config.resolutions)
-            axes.set_xlabel(f"n of {comparison.usual.method}")
+            axes.set_xlabel(f"n of {comparison.usual.name}")
             axes.set_title(title)
         plots.legend_right(axes)
         drawn = plots.svg(figure, f"equal-{index}-{quantity}")

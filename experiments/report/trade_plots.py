@@ -59,7 +59,7 @@ def _members(records: Mapping[str, Record], index: int, error: str, cost: str, n
 
 def _legend(config: Config) -> list[Line2D]:
     """One entry for each method."""
-    records = list({r.method: r.record() for r in config.methods}.values())
+    records = list({r.name: r.record() for r in config.methods}.values())
     handles = []
     for record in records:
         own = look(record["method"])

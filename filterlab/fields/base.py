@@ -102,6 +102,33 @@ class Field(ABC):
         value, gradient = self.jet(points, 1)
         return value, gradient
 
+    @property
+    def device(self) -> torch.device | None:
+        """Where what it was built from is; None: it is computed wherever the points are."""
+        return None
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether its values have derivatives of their own, by what it was built from; asked of one point."""
+        center = torch.tensor([self.domain.center], dtype=torch.float64, device=self.device)
+        return self.jet(center if self.channels is None else center[None], 0)[0].requires_grad
+
+    def select(self, n: int, c: int) -> Field:
+        """The unbatched field of entry n and channel c of a batched one.
+
+        Here it costs as much as the whole field; one given by coefficients gives a view of them.
+
+        Raises:
+            ValueError: this field is not batched.
+            IndexError: no such entry or channel.
+        """
+        if self.channels is None:
+            raise ValueError("select needs a batched field, (N, C); this one is unbatched")
+        for name, index, count in zip(("entry", "channel"), (n, c), self.channels, strict=True):
+            if not -count <= index < count:
+                raise IndexError(f"expected an {name} of {count}; got {index}")
+        return _Selected(self, n, c)
+
     def relative_to(self, origin: Sequence[float]) -> Field:
         """The same function of points that are measured from `origin`: g(p) = f(origin + p).
 
@@ -121,12 +148,32 @@ class Field(ABC):
         return _Relative(self, origin)
 
 
+class _Selected(Field):
+    """Entry n and channel c of any batched field."""
+
+    def __init__(self, field: Field, n: int, c: int) -> None:
+        self.field, self.n, self.c = field, n, c
+        self.domain, self.max_order, self.scheme = field.domain, field.max_order, field.scheme
+
+    @property
+    def device(self) -> torch.device | None:
+        return self.field.device
+
+    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+        return tuple(x[self.n, self.c] for x in self.field.jet(points[None], order))
+
+
 class _Relative(Field):
     """Any field in a world whose origin was moved; sums of points and origin are float64."""
 
     def __init__(self, field: Field, origin: tuple[float, float, float]) -> None:
         self.field, self.origin = field, origin
         self.domain, self.max_order, self.channels = field.domain.relative_to(origin), field.max_order, field.channels
+        self.scheme = field.scheme
+
+    @property
+    def device(self) -> torch.device | None:
+        return self.field.device
 
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         points = check_points(points, self.channels)

@@ -200,6 +200,16 @@ class GridField(Field):
         return [self.scheme.evaluation(coefficients, placement, order) for order in range(self.max_order + 1)]
 
     @property
+    def device(self) -> torch.device:
+        """Where the coefficients are."""
+        return self.coefficients.values.device
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether derivatives by the coefficients are asked."""
+        return self.coefficients.values.requires_grad
+
+    @property
     def placement(self) -> Placement:
         """How world points become coordinates of the coefficients."""
         return self.coefficients.placement(self.domain.geometry)

@@ -2,52 +2,57 @@
 
     rays ─▶ (t_near, t_far) ─▶ samples ─▶ transfer function ─▶ shading ─▶ compositing
 
-What is done here: cameras and rays, and where rays enter and leave the field; parts of them; the background. Along the
-rays goes a *marcher*: the fused one (`render.fused`, vector code) for fields whose scheme is "fused", where it can run
-as asked, else the plain one (`render.plain`, torch) for any field. The image does not depend on which.
+What every renderer needs is in `render.image`; here rays are cut into segments. Along them goes a *marcher*: the fused
+one (`render.fused`, vector code) for fields whose scheme is "fused", where it can run as asked, else the plain one
+(`render.plain`, torch) for any field. The image does not depend on which.
 
 How work is cut up never changes a number: every ray is marched for itself, and jitter is a hash of the pixel number.
 """
 
 from __future__ import annotations
 
-import math
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import SupportsFloat, SupportsIndex
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from filterlab.fields.base import Domain, Field
-from filterlab.fields.grid import GridField
 from filterlab.ops.march import Chords
 from filterlab.ops.reference.march import rays_at_once
-from filterlab.ops.reference.optics import absorbed
-from filterlab.render.camera import Camera, check_size
+from filterlab.render.camera import Camera
 from filterlab.render.fused import FusedMarcher, why_not_fused
+from filterlab.render.image import (
+    Canvas,
+    PixelRays,
+    Progress,
+    RayTensors,
+    check_background,
+    check_camera,
+    check_field,
+    device_of,
+    over,
+    reporting,
+    unbatched,
+)
 from filterlab.render.plain import Marcher, Medium, PlainMarcher
-from filterlab.render.rays import Region, check_rays, check_region, intersect, jitter, segment_count
+from filterlab.render.rays import Region, Spans, check_region, jitter, segment_count, spans
+from filterlab.render.sampling import Sampling
 from filterlab.render.shading import Shading
-from filterlab.render.tiles import tiled_part
 from filterlab.render.transfer import TransferFunction
-
-Rays = tuple[Tensor, Tensor]
-Progress = bool | None | Callable[[int, int], None]
 
 _PART = 1 << 16  # rays that are cut at a time; more would only leave the caches
 _PART_OF_GPU = 1 << 20  # fewer would leave it waiting for Python
 _MOST_SEGMENTS = 2.0**62  # of a ray, that can be counted; no limit on the number of samples is as high
 _BYTES_PER_RAY = 256
 _BYTES_PER_RAY_SAVED = 2048  # of the fused marcher while autograd records
+_DEFAULT = Sampling()
 
 
 def render(
     field: Field,
-    camera: Camera | Rays,
+    camera: Camera | RayTensors,
     transfer: TransferFunction,
     *,
     size: Sequence[int] | None = None,
@@ -115,71 +120,60 @@ def render(
     Source: Max, Optical models for direct volume rendering, 1995; step and opacity as in Engel et al., Real-Time Volume
     Graphics, 2006.
     """
-    job = prepare(
+    sampling = Sampling(step, jitter_seed, termination, dtype, max_samples, memory)
+    frame = prepare(
         field,
         camera,
         transfer,
         size=size,
-        step=step,
         shading=shading,
         background=background,
         region=region,
-        jitter_seed=jitter_seed,
-        termination=termination,
-        dtype=dtype,
+        sampling=sampling,
         device=device,
-        max_samples=max_samples,
-        memory=memory,
     )
-    return job.run(progress)
+    return frame.run(progress)
 
 
 def prepare(
     field: Field,
-    camera: Camera | Rays,
+    camera: Camera | RayTensors,
     transfer: TransferFunction,
     *,
     size: Sequence[int] | None = None,
-    step: float = 0.5,
     shading: Shading | None = None,
     background: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
     region: Region | None = None,
-    jitter_seed: int | None = None,
-    termination: float | None = None,
-    dtype: torch.dtype = torch.float32,
+    sampling: Sampling = _DEFAULT,
     device: torch.device | str | None = None,
-    max_samples: int = 2**34,
-    memory: int = 2**28,
-) -> Job:
+) -> Frame:
     """All that `render` decides before it marches; arguments and errors are those of `render`."""
-    _check_arguments(field, camera, transfer, shading, step, termination, dtype, max_samples, memory)
-    device = torch.device(device or _device_of(camera, transfer))
-    view = _View.of(camera, size, device)
-    color = _check_background(background, device)
+    _check_arguments(field, camera, transfer, shading)
+    asked = sampling.step_in(field.domain.voxel_size)
+    device = torch.device(device or device_of(camera) or transfer.positions.device)
+    seen = PixelRays.of(camera, size, device)
+    color = check_background(background, device)
     box = None if region is None else check_region(region)
-    differentiable = torch.is_grad_enabled() and (
-        view.requires_grad
-        or transfer.requires_grad
-        or color.requires_grad
-        or (shading is not None and shading.requires_grad)
-        or _depends_on_parameters(field, dtype, device)
+    differentiable = torch.is_grad_enabled() and any(
+        x.requires_grad for x in (seen, transfer, color, field, shading) if x is not None
     )
+    dtype = sampling.dtype
     brightest = transfer.brightest if shading is None else shading.brightest(transfer.brightest)
     brightest = max(brightest, float(color.detach().max()), 1.0)
-    lengths = _lengths(field.domain, step, transfer.unit)
+    lengths = _lengths(field.domain, asked, transfer.unit)
     _check_range(dtype, lengths | (shading.numbers if shading else {}) | {"the brightest colour": brightest})
     transfer, color = transfer.to(dtype, device), color.to(dtype)
+    termination = sampling.termination
     faint = 0.0 if termination is None or differentiable else termination / brightest
-    asked = float(step) * field.domain.voxel_size
-    length = lengths["the step"]
-    media = [Medium(one, transfer, shading, length, faint, differentiable) for one in _unbatched(field)]
-    cut = _Cut(field.domain, box, length, asked / length, jitter_seed, differentiable and view.requires_grad)
-    marcher, at_once = _marcher(media[0], memory)
-    parts = [_Part(range(i, min(i + at_once, view.count))) for i in range(0, view.count, at_once)]
-    if view.count * _BYTES_PER_RAY <= memory:  # else rays are cut again for every image
-        parts = [replace(part, chords=cut(view, view.pixels(part.order))) for part in parts]
-    total = cut.count_all(view, parts, len(media), max_samples)
-    return Job(media, marcher, view, cut, parts, total, color, field.channels)
+    step = lengths["the step"]
+    media = [Medium(one, transfer, shading, step, faint, differentiable) for one in unbatched(field)]
+    cut = Cut(field.domain, box, step, asked / step, sampling.jitter_seed, differentiable and seen.requires_grad)
+    marcher, at_once = _marcher(media[0], sampling.memory)
+    parts = [_Part(order) for order in seen.parts(at_once)]
+    if seen.count * _BYTES_PER_RAY <= sampling.memory:  # else rays are cut again for every image
+        parts = [replace(part, chords=cut(seen, seen.pixels(part.order))) for part in parts]
+    total = _count(cut, seen, parts, len(media), sampling.max_samples)
+    return Frame(media, marcher, Canvas(seen, field.channels, differentiable), cut, parts, total, color)
 
 
 @dataclass(frozen=True)
@@ -191,7 +185,7 @@ class _Part:
 
 
 @dataclass(frozen=True)
-class Job:
+class Frame:
     """An image that is ready to be marched.
 
     Attributes:
@@ -202,17 +196,16 @@ class Job:
 
     media: list[Medium]
     marcher: Marcher
-    _view: _View
-    _cut: _Cut
+    _canvas: Canvas
+    _cut: Cut
     _parts: Sequence[_Part]
     samples: int
     _background: Tensor
-    _channels: tuple[int, int] | None
 
     @property
     def pixels(self) -> int:
         """Rays of one image."""
-        return self._view.count
+        return self._canvas.seen.count
 
     @property
     def image_bytes(self) -> int:
@@ -228,36 +221,24 @@ class Job:
 
     def chords(self, pixels: Tensor) -> Chords:
         """The rays of some pixels, cut into segments."""
-        return self._cut(self._view, pixels)
+        return self._cut(self._canvas.seen, pixels)
 
     def run(self, progress: Progress = False) -> Tensor:
         """The image, as `render` gives it."""
-        with _reporting(progress, self.samples) as report:
-            images = self._images(report)
+        with reporting(progress, self.samples) as report:
+            images = self._canvas.filled(self._marched(report), self._background)
             report(self.samples)
-        return images.reshape(*(self._channels or ()), *self._view.shape, 4)
-
-    def _images(self, report: Callable[[int], None]) -> Tensor:
-        """(images, pixels, 4): without derivatives every part is written where it belongs, and nothing is copied."""
-        background, everywhere = self._background, self._view.pixels
-        if self.media[0].differentiable:
-            marched = torch.cat([image for _, _, image in self._marched(report)] or [background.new_zeros(0, 4)])
-            marched = marched.reshape(len(self.media), self.pixels, 4)
-            return torch.empty_like(marched).index_copy(1, everywhere(range(self.pixels)), marched)
-        images = background.new_empty(len(self.media), self.pixels, 4)
-        for number, part, image in self._marched(report):
-            images[number].index_copy_(0, everywhere(part.order), image)
         return images
 
-    def _marched(self, report: Callable[[int], None]) -> Iterator[tuple[int, _Part, Tensor]]:
-        """(number of the image, part, its pixels (R, 4)), one after the other."""
+    def _marched(self, report: Callable[[int], None]) -> Iterator[tuple[int, range, Tensor]]:
+        """(number of the image, places, their pixels (R, 4)), one part after the other."""
         done = 0
         for number, medium in enumerate(self.media):
             for part in self._parts:
-                chords = part.chords or self.chords(self._view.pixels(part.order))
+                chords = part.chords or self.chords(self._canvas.seen.pixels(part.order))
                 light, depth = self.marcher.march(medium, chords, lambda n, done=done: report(done + n))
                 done += int(chords.count.sum())  # with those that early termination saved
-                yield number, part, _over(light, depth[:, None], self._background)
+                yield number, part.order, over(light, depth[:, None], self._background)
 
 
 def _marcher(medium: Medium, memory: int) -> tuple[Marcher, int]:
@@ -272,75 +253,8 @@ def _marcher(medium: Medium, memory: int) -> tuple[Marcher, int]:
     return PlainMarcher(memory), part
 
 
-def _unbatched(field: Field) -> list[Field]:
-    """The field, or those of all entries and channels of a batched one, in the order of (N, C)."""
-    if field.channels is None:
-        return [field]
-    entries, channels = field.channels
-    select = field.select if isinstance(field, GridField) else lambda n, c: _Selected(field, n, c)
-    return [select(n, c) for n in range(entries) for c in range(channels)]
-
-
-class _Selected(Field):
-    """Entry n and channel c of any batched field; costs as much as the whole field."""
-
-    def __init__(self, field: Field, n: int, c: int) -> None:
-        self.field, self.n, self.c = field, n, c
-        self.domain, self.max_order = field.domain, field.max_order
-
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
-        return tuple(x[self.n, self.c] for x in self.field.jet(points[None], order))
-
-
 @dataclass(frozen=True)
-class _View:
-    """The rays of an image; made where they are needed, a part at a time.
-
-    Attributes:
-        shape: of the image.
-        pixels: the numbers of those that stand at some places in the order in which they are marched.
-        rays: the rays of some pixels.
-        requires_grad: whether derivatives by the rays are asked.
-    """
-
-    shape: tuple[int, ...]
-    pixels: Callable[[range], Tensor]
-    rays: Callable[[Tensor], Rays]
-    requires_grad: bool
-
-    @property
-    def count(self) -> int:
-        """How many pixels there are."""
-        return math.prod(self.shape)
-
-    @classmethod
-    def of(cls, camera: Camera | Rays, size: Sequence[int] | None, device: torch.device) -> _View:
-        if isinstance(camera, Camera):
-            if size is None:
-                raise ValueError("size=(width, height) is needed with a camera")
-            width, height = check_size(size)
-            pixels = _tile_by_tile(height, width, device)
-            return cls((height, width), pixels, lambda p: camera.pixel_rays(p, width, height), camera.requires_grad)
-        if size is not None:
-            raise ValueError(f"size goes with a camera; rays bring their own shape; got size={size!r}")
-        origins, directions = camera
-        o, d = (r.reshape(-1, 3).to(device) for r in check_rays(origins, directions))
-        requires_grad = o.requires_grad or d.requires_grad
-        shape = tuple(origins.shape[:-1])
-        pixels = _tile_by_tile(*shape, device) if len(shape) == 2 else _one_by_one(device)
-        return cls(shape, pixels, lambda p: (o[p], d[p]), requires_grad)
-
-
-def _tile_by_tile(height: int, width: int, device: torch.device) -> Callable[[range], Tensor]:
-    return lambda order: tiled_part(height, width, order.start, order.stop, device)
-
-
-def _one_by_one(device: torch.device) -> Callable[[range], Tensor]:
-    return lambda order: torch.arange(order.start, order.stop, device=device)
-
-
-@dataclass(frozen=True)
-class _Cut:
+class Cut:
     """Cuts rays to a field's domain and into segments; all lengths are world lengths.
 
     The step that was asked for is `stretch` times `step`: more than 1 only where that is longer than any ray inside.
@@ -353,24 +267,19 @@ class _Cut:
     jitter_seed: int | None
     differentiable: bool
 
-    def __call__(self, view: _View, pixels: Tensor) -> Chords:
+    def __call__(self, seen: PixelRays, pixels: Tensor) -> Chords:
         """The parts inside of the rays of `pixels` `(R,)`."""
         if self.differentiable:
-            entry, direction, length = checkpoint(self.inside, view, pixels, use_reentrant=False)  # type: ignore[misc]
+            inside: Spans = checkpoint(self.inside, seen, pixels, use_reentrant=False)  # type: ignore[assignment]
         else:
-            entry, direction, length = self.inside(view, pixels)
+            inside = self.inside(seen, pixels)
         offset = self.offset(pixels)
-        count = segment_count(length, self.step, offset).clamp_max(_MOST_SEGMENTS).long()
-        return Chords(entry, direction, length, offset, count)
+        count = segment_count(inside.length, self.step, offset).clamp_max(_MOST_SEGMENTS).long()
+        return Chords(inside.entry, inside.direction, inside.length, offset, count)
 
-    def inside(self, view: _View, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where rays enter the domain `(R, 3)`, their directions and lengths inside `(R,)`."""
-        origins, directions = view.rays(pixels)
-        near, far = intersect(origins, directions, self.domain, self.region)
-        hit = far.detach() > near.detach()
-        length = torch.where(hit, far - near, torch.zeros_like(far))
-        near = torch.where(hit, near, torch.zeros_like(near))
-        return origins + near[:, None] * directions, directions, length
+    def inside(self, seen: PixelRays, pixels: Tensor) -> Spans:
+        """The parts of the rays that lie in the domain."""
+        return spans(*seen.rays(pixels), self.domain, self.region)
 
     def offset(self, pixels: Tensor) -> Tensor:
         """How far into a step the first segment reaches, `(R,)`, in (0, 1]."""
@@ -378,73 +287,42 @@ class _Cut:
             return torch.ones_like(pixels, dtype=torch.float64)
         return (self.stretch * jitter(self.jitter_seed, pixels)).clamp_max(1)
 
-    def count_all(self, view: _View, parts: Sequence[_Part], images: int, limit: int) -> int:
-        """How many samples the images take. Raises ValueError above `limit`."""
-        total = 0.0
-        for part in parts:
-            if part.chords is not None:
-                total += float(part.chords.count.double().sum())
-            else:
-                pixels = view.pixels(part.order)
-                total += float(segment_count(self.inside(view, pixels)[2], self.step, self.offset(pixels)).sum())
-        total *= images
-        if not total <= limit:
-            more = "more than " if total >= _MOST_SEGMENTS else ""
-            raise ValueError(
-                f"the image would take {more}{total:.3g} samples; the limit is max_samples={limit:.3g}: "
-                "use a longer step, a smaller image or region, or raise max_samples"
-            )
-        return int(total)
+    def count(self, seen: PixelRays, pixels: Tensor) -> float:
+        """How many segments the rays of some pixels have together."""
+        return float(segment_count(self.inside(seen, pixels).length, self.step, self.offset(pixels)).sum())
 
 
-def _over(light: Tensor, depth: Tensor, background: Tensor) -> Tensor:
-    """Emitted light `(R, 3)` of rays of optical depth `(R, 1)` over a background `(3,)`: RGB and opacity `(R, 4)`."""
-    rgb = light + torch.exp(-depth) * background
-    return torch.cat((rgb, absorbed(depth)), -1).to(background.dtype)
+def _count(cut: Cut, seen: PixelRays, parts: Sequence[_Part], images: int, limit: int) -> int:
+    """How many samples the images take. Raises ValueError above `limit`."""
+    total = 0.0
+    for part in parts:
+        kept = part.chords
+        total += cut.count(seen, seen.pixels(part.order)) if kept is None else float(kept.count.double().sum())
+    total *= images
+    if not total <= limit:
+        more = "more than " if total >= _MOST_SEGMENTS else ""
+        raise ValueError(
+            f"the image would take {more}{total:.3g} samples; the limit is max_samples={limit:.3g}: "
+            "use a longer step, a smaller image or region, or raise max_samples"
+        )
+    return int(total)
 
 
 def _check_arguments(
-    field: Field,
-    camera: Camera | Rays,
-    transfer: TransferFunction,
-    shading: Shading | None,
-    step: float,
-    termination: float | None,
-    dtype: torch.dtype,
-    max_samples: int,
-    memory: int,
+    field: Field, camera: Camera | RayTensors, transfer: TransferFunction, shading: Shading | None
 ) -> None:
-    if not isinstance(field, Field):
-        raise TypeError(f"field must be a Field (fl.reconstruct(volume, ...) or a signal); got {type(field).__name__}")
-    if field.channels is not None and 0 in field.channels:
-        raise ValueError(f"a batched field must have at least one entry and channel; got (N, C) = {field.channels}")
-    if not 0 < field.domain.voxel_size < math.inf:
-        raise ValueError(f"field.domain.voxel_size must be a positive world length; got {field.domain.voxel_size}")
-    pair = isinstance(camera, tuple | list) and len(camera) == 2 and all(isinstance(r, Tensor) for r in camera)
-    if not (isinstance(camera, Camera) or pair):
-        raise TypeError(f"camera must be a Camera or two tensors (origins, directions); got {type(camera).__name__}")
+    check_field(field)
+    check_camera(camera)
     if not isinstance(transfer, TransferFunction):
         raise TypeError(f"transfer must be a TransferFunction; got {type(transfer).__name__}")
     if not isinstance(shading, Shading | None):
         raise TypeError(f"shading must be a Shading, or None for unlit; got {type(shading).__name__}")
-    if not 0 < _number(step) < math.inf:
-        raise ValueError(f"step must be a positive number of voxels; got {step!r}")
-    if not float(step) * field.domain.voxel_size > 0:
-        raise ValueError(f"step must be a world length in float64; got {step!r} voxels of {field.domain.voxel_size:g}")
-    if termination is not None and not 0 < _number(termination) < 1:
-        raise ValueError(f"termination must be a transmittance between 0 and 1, or None; got {termination!r}")
-    if dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"dtype must be torch.float32 or torch.float64; got {dtype}")
-    if not _number(max_samples) > 0:
-        raise ValueError(f"max_samples must be a positive number; got {max_samples!r}")
-    if not isinstance(memory, SupportsIndex) or memory <= 0:
-        raise ValueError(f"memory must be a positive whole number of bytes; got {memory!r}")
 
 
 def _lengths(domain: Domain, step: float, unit: float) -> dict[str, float]:
     """World lengths and their inverses that a marcher computes with, by what they are."""
     longest = 2 * domain.diagonal  # beyond every end there is nothing to cut, only digits to lose
-    length = min(float(step) * domain.voxel_size, longest)
+    length = min(step, longest)
     return {
         "the step": length,
         "the length of a ray": longest,
@@ -464,49 +342,3 @@ def _check_range(dtype: torch.dtype, numbers: Mapping[str, float]) -> None:
             raise ValueError(
                 f"an image in {kind} is computed with numbers up to {limit:.3g}; {name} is {number:.3g}{wider}"
             )
-
-
-def _number(value: object) -> float:
-    """The value as one number; NaN where it is none."""
-    try:
-        return float(value) if isinstance(value, SupportsFloat) else math.nan
-    except (TypeError, ValueError, ArithmeticError, RuntimeError):  # a tensor of several, an integer beyond all floats
-        return math.nan
-
-
-def _check_background(background: Sequence[float] | Tensor, device: torch.device) -> Tensor:
-    try:
-        color = torch.as_tensor(background, dtype=torch.float64, device=device)
-    except (TypeError, ValueError, ArithmeticError, RuntimeError):
-        color = torch.empty(0)
-    if color.shape != (3,) or not color.detach().isfinite().all() or (color.detach() < 0).any():
-        raise ValueError(f"background must be three finite numbers ≥ 0 (linear RGB); got {background!r}")
-    return color
-
-
-def _device_of(camera: Camera | Rays, transfer: TransferFunction) -> torch.device:
-    device = camera.device if isinstance(camera, Camera) else camera[0].device
-    return device or transfer.positions.device
-
-
-def _depends_on_parameters(field: Field, dtype: torch.dtype, device: torch.device) -> bool:
-    """Whether the field's values carry a gradient of their own: asked of one point, since fields are opaque here."""
-    center = torch.tensor([field.domain.center], dtype=dtype, device=device)
-    return field.jet(center if field.channels is None else center[None], 0)[0].requires_grad
-
-
-@contextmanager
-def _reporting(progress: Progress, total: int) -> Iterator[Callable[[int], None]]:
-    """A function to call with the number of samples done."""
-    if callable(progress):
-        yield lambda done: progress(done, total)
-    elif progress or (progress is None and sys.stderr.isatty()):
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-        columns = (TextColumn("rendering"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True)) as bar:
-            task = bar.add_task("rendering", total=max(total, 1))
-            yield lambda done: bar.update(task, completed=done if total else 1)
-    else:
-        yield lambda done: None

@@ -6,6 +6,7 @@ A ray is o + t d with a unit direction d, so t is a world distance. Rays and dis
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -104,6 +105,23 @@ def intersect(
         region_near, region_far = slab(origins, directions, *check_region(region))
         near, far = torch.maximum(near, region_near), torch.minimum(far, region_far)
     return near.clamp_min(0), far
+
+
+class Spans(NamedTuple):
+    """The parts of rays in a domain: entries `(R, 3)`, unit directions `(R, 3)`, lengths `(R,)`; 0: it misses."""
+
+    entry: Tensor
+    direction: Tensor
+    length: Tensor
+
+
+def spans(origins: Tensor, directions: Tensor, domain: Domain, region: Region | None = None) -> Spans:
+    """Where rays enter the domain (and the region), and how long they are inside; differentiable in both."""
+    near, far = intersect(origins, directions, domain, region)
+    hit = far.detach() > near.detach()
+    length = torch.where(hit, far - near, torch.zeros_like(far))
+    near = torch.where(hit, near, torch.zeros_like(near))
+    return Spans(origins + near[:, None] * directions, directions, length)
 
 
 def segment_count(length: Tensor, step: float, offset: Tensor | float = 1.0) -> Tensor:

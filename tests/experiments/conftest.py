@@ -15,7 +15,7 @@ description: a tiny one
 seed: 3
 studies:
   - {signal: {name: gaussian, parameters: {sigma: 0.5}}, resolutions: [4, 8], fit_from: 4}
-methods: [trilinear, notch, {method: notch, prefilter: false}]
+methods: [trilinear, notch, {name: notch, prefilter: false}]
 points: 50
 """
 

@@ -4,9 +4,10 @@ import pytest
 
 import filterlab as fl
 from experiments.__main__ import main, split_overrides
-from experiments.config import Recipe, known_configs, volume_path
+from experiments.config import Recipe, known_configs
 from experiments.registry import EXPERIMENTS, experiment_of, load
 from filterlab.io.config import ConfigError, dump_config, loads_config
+from filterlab.scenes.model import find_volume
 
 
 def refused(path, overrides=None):
@@ -46,10 +47,11 @@ def test_every_experiment_has_a_config():
         ({"studies.0.extra": "1"}, "studies[0].extra", ["unknown key", "fit_from"]),
         ({"boundary": "clamp"}, "boundary", ["mirror", "zeros"]),
         ({"methods": "[notch, notch]"}, "methods", ["notch is listed twice"]),
-        ({"methods.0": "{method: ncrsi, prefilter: false}"}, "methods[0]", ["no prefilter"]),
-        ({"methods.0": "{method: notch, gradient: central}"}, "methods[0]", ["analytic"]),
-        ({"methods.0": "{method: mitchell, scheme: eight_trilinear}"}, "methods[0]", ["direct"]),
-        ({"methods.0": "{method: notch, sampler: texture_unit}"}, "methods[0]", ["eight_trilinear"]),
+        ({"methods.0": "{name: ncrsi, prefilter: false}"}, "methods[0]", ["no prefilter"]),
+        ({"methods.0": "{name: notch, gradient: central}"}, "methods[0]", ["analytic"]),
+        ({"methods.0": "{name: mitchell, scheme: eight_trilinear}"}, "methods[0]", ["direct"]),
+        ({"methods.0": "{name: notch, sampler: texture_unit}"}, "methods[0]", ["eight_trilinear"]),
+        ({"methods.0": "{method: notch}"}, "methods[0]", ["called name", "{name: notch"]),
         ({"device": "abacus"}, "device", ["cpu"]),
         ({"device": "meta"}, "device", ["cpu", "'meta'"]),
         ({"studies.0.signal": "{name: sphere, parameters: {radius: [.1, .2, .3]}}"}, "studies[0].signal", ["a number"]),
@@ -57,7 +59,7 @@ def test_every_experiment_has_a_config():
         (
             {"studies.0.signal": "{name: plane-wave, parameters: {wave_vector: [1, 2]}}"},
             "studies[0].signal",
-            ["[1.0, 2.0]"],
+            ["three numbers", "(1.0, 2.0)"],
         ),
         ({"studies.0.signal": "{name: gaussian, parameters: {sigma: 0}}"}, "studies[0].signal", ["sigma"]),
         ({"studies.0.signal": "{name: gaussian, parameters: {sigma: 1e-200}}"}, "studies[0].signal", ["finite"]),
@@ -84,7 +86,7 @@ def test_an_unknown_experiment_or_config_lists_the_known(tmp_path):
 
 def test_overrides_reach_the_config(tiny_rms):
     _, _, config = load(str(tiny_rms), {"methods.0": "tricubic", "studies.0.resolutions": "[5, 6, 7]"})
-    assert config.methods[0] == Recipe(method="tricubic")
+    assert config.methods[0] == Recipe(name="tricubic")
     assert config.studies[0].resolutions == [5, 6, 7]
 
 
@@ -101,15 +103,15 @@ def test_an_override_needs_one_value(words, capsys):
 
 def test_a_recipe_knows_its_defaults():
     assert Recipe.model_validate("ncrsi").gradient_kind == "central"
-    assert Recipe(method="triquadratic").declared_order == 3
-    assert Recipe(method="triquadratic", prefilter=False).declared_order == 2
+    assert Recipe(name="triquadratic").declared_order == 3
+    assert Recipe(name="triquadratic", prefilter=False).declared_order == 2
 
 
 def test_the_sampled_scheme_says_which_gradient_it_gives():
     with pytest.raises(ValueError, match="central"):
-        Recipe(method="trilinear", scheme="eight_trilinear")
-    sampled = Recipe(method="trilinear", gradient="central", scheme="eight_trilinear")
-    assert (sampled.gradient_kind, Recipe(method="ncrsi", scheme="eight_trilinear").gradient_kind) == ("central",) * 2
+        Recipe(name="trilinear", scheme="eight_trilinear")
+    sampled = Recipe(name="trilinear", gradient="central", scheme="eight_trilinear")
+    assert (sampled.gradient_kind, Recipe(name="ncrsi", scheme="eight_trilinear").gradient_kind) == ("central",) * 2
     for name, key in (
         ("texture_precision", "methods"),
         ("texture_precision", "image_methods"),
@@ -118,7 +120,7 @@ def test_the_sampled_scheme_says_which_gradient_it_gives():
         with pytest.raises(ConfigError, match="gradient='central'"):
             load(name, {key: "[trilinear]"})
     with pytest.raises(ConfigError, match="leave them out"):
-        load("texture_precision", {"methods": "[{method: notch, scheme: eight_trilinear}]"})
+        load("texture_precision", {"methods": "[{name: notch, scheme: eight_trilinear}]"})
 
 
 def test_seed_and_device_hold_for_sections_without_their_own():
@@ -166,11 +168,11 @@ def test_without_configs_the_command_says_where_it_looked(tmp_path, monkeypatch,
 def test_volume_files_are_found_by_name(tmp_path, monkeypatch):
     (tmp_path / "scan.nrrd").write_bytes(b"x")
     monkeypatch.setenv("FILTERLAB_VOLUMES", str(tmp_path))
-    assert volume_path("scan.nrrd") == tmp_path / "scan.nrrd"
-    assert volume_path("pydantic:main.py").is_file()
+    assert find_volume("scan.nrrd") == tmp_path / "scan.nrrd"
+    assert find_volume("pydantic:main.py").is_file()
     with pytest.raises(ValueError, match=r"found none at .*other\.nrrd"):
-        volume_path("other.nrrd")
+        find_volume("other.nrrd")
     with pytest.raises(ValueError, match=r"no 'scan\.nrrd'"):
-        volume_path("pydantic:scan.nrrd")
+        find_volume("pydantic:scan.nrrd")
     with pytest.raises(ValueError, match="pip install nonesuch"):
-        volume_path("nonesuch:scan.nrrd")
+        find_volume("nonesuch:scan.nrrd")

@@ -55,13 +55,13 @@ def tiny(name, scan):
         },
         "rms_error": {
             "studies": [{"signal": "gaussian", "resolutions": [4, 6], "fit_from": 4}],
-            "methods": ["trilinear", {"method": "trilinear", "gradient": "central"}, "notch"],
+            "methods": ["trilinear", {"name": "trilinear", "gradient": "central"}, "notch"],
             "points": 20,
         },
         "dvr_signal": {
             "signal": "marschner-lobb",
             "resolution": 10,
-            "methods": ["trilinear", {"method": "notch", "prefilter": False}],
+            "methods": ["trilinear", {"name": "notch", "prefilter": False}],
             "view": VIEW,
         },
         "dvr_volume": {
@@ -71,7 +71,7 @@ def tiny(name, scan):
             "zooms": [{"title": "the middle", "window": [0.25, 0.25, 0.75, 0.75]}],
         },
         "texture_precision": {
-            "methods": [{"method": "trilinear", "gradient": "central"}, "triquadratic"],
+            "methods": [{"name": "trilinear", "gradient": "central"}, "triquadratic"],
             "image_methods": ["triquadratic"],
             "sources": [
                 {"title": "signal", "signal": "gaussian", "resolution": 12, "view": VIEW},
@@ -125,10 +125,10 @@ def tiny(name, scan):
         "studies": [{"signal": {"name": "gaussian", "parameters": {"sigma": 0.5}}}],
         "comparisons": [
             {"quantity": "value", "usual": "trilinear"},
-            {"quantity": "gradient", "usual": {"method": "trilinear", "gradient": "central"}},
+            {"quantity": "gradient", "usual": {"name": "trilinear", "gradient": "central"}},
         ],
         "resolutions": [8, 12],
-        "methods": ["triquadratic", {"method": "triquadratic", "prefilter": False}],
+        "methods": ["triquadratic", {"name": "triquadratic", "prefilter": False}],
         "largest": 12,
         "points": 200,
         "timed_points": 50,
@@ -137,7 +137,7 @@ def tiny(name, scan):
     configs["speed_accuracy"] = {
         "sources": [{"signal": "gaussian", "view": deepcopy(VIEW)}],
         "resolutions": [8],
-        "methods": [{"method": "trilinear", "gradient": "central"}, "triquadratic"],
+        "methods": [{"name": "trilinear", "gradient": "central"}, "triquadratic"],
         "variants": [
             {"name": "float32"},
             {"name": "float16", "storage": "float16"},
@@ -260,7 +260,7 @@ def test_marschner_lobb_errors_are_the_known_ones(tmp_path):
         for recipe in config.methods:
             if (recipe.key, n) not in KNOWN:
                 continue
-            v, g = rms_error.evaluate(recipe.reconstruct(volume, config.boundary), points)
+            v, g = rms_error.evaluate(recipe.build(volume, config.boundary), points)
             found = fl.metrics.rms(v, value), fl.metrics.rms(g, gradient, vectors=True)
             for number, expected in zip(found, KNOWN[recipe.key, n], strict=True):
                 # 2 %, plus the rounding of the two digits that 0.0028 and 0.0058 were written with
@@ -400,7 +400,7 @@ def test_a_frame_of_a_time_series_is_that_volume(tmp_path):
         ("series.nii", ["its 3 frames", "frame=0 to frame=2"]),
         ({"file": "series.nii", "frame": 3}, ["from 0 to 2", "got frame 3"]),
         ({"file": "lying.nii", "frame": 0}, ["32000000000 bytes"]),
-        ("batch.npy", ["one volume (D, H, W)", "(2, 1, 3, 4, 5)"]),
+        ("batch.npy", ["one volume of shape (D, H, W)", "(2, 1, 3, 4, 5)"]),
     ],
 )
 def test_a_file_without_the_volume_is_refused_by_its_header(volume, words, tmp_path, scan, monkeypatch, capsys):
@@ -495,7 +495,7 @@ def test_a_mistake_of_ours_keeps_its_traceback(tiny_rms, tmp_path, monkeypatch):
 
 
 def test_the_response_of_the_sampled_scheme_is_measured(ran):
-    sampled = {"method": "trilinear", "gradient": "central", "scheme": "eight_trilinear"}
+    sampled = {"name": "trilinear", "gradient": "central", "scheme": "eight_trilinear"}
     _, records, _ = ran("frequency_response", methods=["trilinear", sampled], figures=[])
     assert all(record["largest_difference"] < 1e-6 for record in records.values())
     assert len(records) == 2
@@ -540,6 +540,6 @@ def test_fitted_orders_are_the_declared_ones(tmp_path):
     for recipe in config.methods:
         if not recipe.prefilter or recipe.gradient is not None:
             continue
-        fields = [recipe.reconstruct(volume, config.boundary) for volume in volumes]
+        fields = [recipe.build(volume, config.boundary) for volume in volumes]
         errors = [float(fl.metrics.rms(field(points), value)) for field in fields]
         assert rms_error.slope(small.fitted, errors) == pytest.approx(recipe.declared_order, abs=0.15), recipe.key

@@ -61,7 +61,7 @@ def waves(role: Role = "training", seed=1):
 
 
 def objective(members, reference="trilinear", weight=0.5):
-    return Objective.of(members, "reflect", weight, Recipe(method=reference))
+    return Objective.of(members, "reflect", weight, Recipe(name=reference))
 
 
 def learned(fit, tmp_path, steps=60, rate=0.1):

@@ -296,7 +296,7 @@ def test_the_signal_itself_is_what_images_are_of(tmp_path):
 def test_the_fused_and_the_plain_renderer_find_the_same(tmp_path):
     found = {}
     for scheme in ("fused", "direct"):
-        config = short(methods=[{"method": "triquadratic", "scheme": scheme}])
+        config = short(methods=[{"name": "triquadratic", "scheme": scheme}])
         record = compute_one(tmp_path / scheme, config, f"volume/triquadratic+{scheme}")
         assert record["scheme"] == scheme
         found[scheme] = record["misfits"]
@@ -336,7 +336,7 @@ def test_a_mistake_in_the_config_ends_in_one_line(changes, words, tmp_path, caps
 
 def test_a_scheme_that_cannot_run_is_refused_before_work(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("filterlab.methods._missing_for_fused", lambda *_: "no compiler")
-    config = tiny(methods=["trilinear", {"method": "notch", "scheme": "fused"}])
+    config = tiny(methods=["trilinear", {"name": "notch", "scheme": "fused"}])
     write(tmp_path / "inverse.yaml", config)
     assert main(["run", str(tmp_path / "inverse.yaml"), "--runs", str(tmp_path / "runs")]) == 2
     assert "methods[1]: scheme='fused' can't run here: no compiler" in capsys.readouterr().err

@@ -111,7 +111,7 @@ TINY = {
     "description": "tiny",
     "sources": [{"signal": "gaussian", "view": VIEW}],
     "resolutions": [8, 12],
-    "methods": [{"method": "trilinear", "gradient": "central"}, "trilinear", "triquadratic"],
+    "methods": [{"name": "trilinear", "gradient": "central"}, "trilinear", "triquadratic"],
     "variants": [
         {"name": "float32"},
         {"name": "float64", "dtype": "float64"},
@@ -121,7 +121,7 @@ TINY = {
     "images": [
         {
             "title": "steps",
-            "methods": ["triquadratic", {"method": "trilinear", "gradient": "central"}],
+            "methods": ["triquadratic", {"name": "trilinear", "gradient": "central"}],
             "resolutions": [8, 12],
             "steps": [2, 0.5],
             "shown": [12, 0.5],
@@ -145,13 +145,13 @@ def test_candidates_are_methods_in_the_variants_they_offer():
     assert "triquadratic+eight_trilinear" in keys
     assert "trilinear+central+in_float64" in keys
     assert "trilinear+eight_trilinear" not in keys, "its analytic gradient has no such scheme"
-    assert Variant(name="x", scheme="eight_trilinear").of(Recipe(method="mitchell")) is None
+    assert Variant(name="x", scheme="eight_trilinear").of(Recipe(name="mitchell")) is None
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"methods": [{"method": "trilinear", "storage": "uint8"}]}, "the variants give scheme"),
+        ({"methods": [{"name": "trilinear", "storage": "uint8"}]}, "the variants give scheme"),
         ({"variants": [{"name": "a"}, {"name": "b"}]}, "variants that differ; .* measured twice"),
         ({"methods": ["mitchell"]}, "'eight samples': expected at least one method"),
         ({"clock": "cpu"}, "expected threads: 1"),

@@ -13,9 +13,10 @@ from filterlab.io.config import ConfigError, dump_config
 from filterlab.methods import reconstruct
 from filterlab.ops.differentiable import march
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
-from filterlab.render.scene import build, find_volume, load_scene, render_scene
+from filterlab.scenes.build import build, load_scene, render_scene
+from filterlab.scenes.model import find_volume
 
-SCENES = Path(__file__).parents[2] / "configs" / "scenes"
+SCENES = Path(__file__).resolve().parent.parent / "configs" / "scenes"
 
 MINIMAL = """
 signal: {name: marschner-lobb, samples: 12}
@@ -82,7 +83,8 @@ def test_defaults_cost_nothing_and_overrides_change_what_they_name(scene_file, m
     scene = load_scene(path)
     prepared = build(scene)
     assert isinstance(prepared.camera, PerspectiveCamera)
-    assert all(prepared.options[k] is None for k in ("shading", "region", "jitter_seed", "termination"))
+    assert prepared.shading is prepared.region is None
+    assert prepared.sampling.jitter_seed is prepared.sampling.termination is None
     lit = []
     run = march.run
     monkeypatch.setattr(march, "run", lambda m, *rest: lit.append(m.lighting) or run(m, *rest))
@@ -137,7 +139,7 @@ def test_volume_files_are_found_beside_the_scene_and_by_variables(scene_file, tm
         ),
         ({"signal.parameters": "{frequency: [1, 2, 3]}"}, r"signal\.parameters: frequency: expected a number; got \(1"),
         ({"signal.parameters": "{voxel_size: -1}"}, r"signal\.parameters: voxel_size.*positive"),
-        ({"signal.parameters": "{frequency: 1e308}"}, r"signal\.parameters: .*marschner-lobb is finite; got .*1e\+308"),
+        ({"signal.parameters": "{frequency: 1e308}"}, r"signal: .*marschner-lobb is finite; got .*1e\+308"),
         ({"method": "{name: notch, boundary: periodic}"}, "known boundarys|boundary.*wrap"),
         ({"method": "{name: tricubic, gradient: central}"}, "offers the gradients analytic"),
         ({"signal.samples": "null", "method": "notch"}, "needs no method"),
@@ -179,14 +181,14 @@ def test_a_signal_that_cannot_be_computed_is_refused(scene_file, monkeypatch):
         return signals.Signal("broken", lambda p: (p @ p.new_tensor(slope), p))
 
     monkeypatch.setitem(signals.SIGNALS, "broken", broken)
-    with pytest.raises(ConfigError, match=r"signal\.parameters: expected parameters with which broken can be computed"):
+    with pytest.raises(ConfigError, match=r"signal: expected parameters with which broken is finite; got .*matmul"):
         load_scene(scene_file(MINIMAL), {"signal": "{name: broken, parameters: {slope: 2}}"})
 
 
 def test_a_scene_shows_one_volume(scene_file, tmp_path, monkeypatch):
     save_volume(torch.rand(1, 2, 3, 4, 5), tmp_path / "batch.npz")
     path = scene_file(MINIMAL.replace("signal: {name: marschner-lobb, samples: 12}", "volume: batch.npz"))
-    monkeypatch.setattr("filterlab.render.scene.load_volume", lambda *_: pytest.fail("the voxels must not be read"))
+    monkeypatch.setattr("filterlab.scenes.model.load_volume", lambda *_: pytest.fail("the voxels must not be read"))
     with pytest.raises(ValueError, match=r"batch\.npz: expected one volume of shape \(D, H, W\).*\(1, 2, 3, 4, 5\)"):
         render_scene(load_scene(path))
 

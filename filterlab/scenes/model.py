@@ -1,39 +1,32 @@
-"""Scenes: what a picture shows and how, as a strict configuration that a YAML file holds.
+"""Models: what scene files and experiment configs say of volumes, signals, methods, cameras and lights.
 
-    scene = load_scene("engine.yaml", {"method": "notch"})
-    image = render_scene(scene)
-
-Each section is a model with a `build` that makes the object of this package it describes; experiments use the same
-sections. A section that is left out costs nothing: no lighting, no gradients.
+Each is a strict section of a YAML file with a `build` that makes the object of this package it describes. A section
+that is left out costs nothing: no lighting, no gradients. `scenes.build` puts them together.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import torch
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
-from torch import Tensor
 
 from filterlab import signals
 from filterlab.fields.base import Domain
 from filterlab.fields.base import Field as FilterlabField
 from filterlab.fields.storage import StorageName
 from filterlab.io.bounded import VolumeFileError
-from filterlab.io.config import StrictModel, load_config, unknown_name
-from filterlab.io.volumes import describe, load_volume
-from filterlab.methods import METHODS, reconstruct
+from filterlab.io.config import StrictModel, unknown_name
+from filterlab.io.volumes import VolumeHeader, describe, load_volume
+from filterlab.methods import METHODS, Method, reconstruct
 from filterlab.missing_values import NanChoice
-from filterlab.recommendation import recommend, report
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
-from filterlab.render.dvr import Progress, render
 from filterlab.render.rays import check_region
 from filterlab.render.shading import Light, Shading
 from filterlab.render.transfer import TransferFunction
@@ -52,6 +45,12 @@ Pixels = Annotated[int, Field(ge=1, le=2**15)]
 
 
 def _known_method(name: str) -> str:
+    if name not in METHODS:
+        raise ValueError(unknown_name("method", name, METHODS))
+    return name
+
+
+def _known_method_or_auto(name: str) -> str:
     if name not in (*METHODS, AUTO):
         raise ValueError(unknown_name("method", name, (*METHODS, AUTO)))
     return name
@@ -86,45 +85,57 @@ def _named(value: Any) -> Any:
 
 # a section that a bare name may stand for is validated as Python data, where a strict tuple would be no list
 _Listed = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
-Parameters = dict[str, float | Annotated[Vector, _Listed]]
+Parameters = dict[str, float | Annotated[tuple[float, ...], _Listed]]
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------------
 
 
 class VolumeFile(StrictModel):
-    """A volume file.
+    """A volume file; a bare name stands for the file as it is.
 
     Attributes:
-        file: a path; `$NAME` in it stands for an environment variable. A path that is not absolute is looked for in the
-            folder of the scene, in the current folder, and in the folder named by $FILTERLAB_VOLUMES.
+        file: a path; `$NAME` in it stands for an environment variable. One that is not absolute is looked for in the
+            folder of the scene, in the current folder, and in the folder named by $FILTERLAB_VOLUMES; `package:path` is
+            a file that comes with an installed Python package (`nibabel:tests/data/example4d.nii.gz`).
+        frame: which volume of a NIfTI time series; see `filterlab.load_volume`.
     """
 
     file: Annotated[str, Field(min_length=1)]
+    frame: Annotated[int, Field(ge=0)] | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _from_path(cls, value: Any) -> Any:
         return {"file": value} if isinstance(value, str) else value
 
-    @model_validator(mode="after")
-    def _found(self, info: ValidationInfo) -> VolumeFile:
-        folder = Path((info.context or {}).get("folder", "."))
-        object.__setattr__(self, "file", str(find_volume(self.file, folder)))
-        return self
+    def path(self, folder: Path = Path()) -> Path:
+        """The file, absolute. Raises ValueError if there is none; the message lists where it was looked for."""
+        return find_volume(self.file, folder)
+
+    def header(self) -> VolumeHeader:
+        """What the file says of its volume; no voxels are read.
+
+        Raises VolumeFileError for a damaged file, or one that holds several volumes.
+        """
+        header = describe(self.path(), frame=self.frame)
+        if len(header.shape) != 3:
+            raise VolumeFileError(
+                self.path(), "one volume of shape (D, H, W) to show", f"a batch (N, C, D, H, W) = {header.shape}"
+            )
+        return header
 
     def load(self) -> Volume:
-        """The volume. Raises VolumeFileError for a damaged file, or one that holds several volumes."""
-        shape = describe(self.file).shape
-        if len(shape) != 3:
-            raise VolumeFileError(
-                self.file, "one volume of shape (D, H, W) to show", f"a batch (N, C, D, H, W) = {shape}"
-            )
-        return load_volume(self.file)
+        """The volume, with its geometry. Raises VolumeFileError as `header` does."""
+        self.header()
+        return load_volume(self.path(), frame=self.frame)
 
 
-def find_volume(name: str, folder: Path) -> Path:
+def find_volume(name: str, folder: Path = Path()) -> Path:
     """The existing file that `name` stands for (see `VolumeFile`), absolute. Raises ValueError if there is none."""
+    package, colon, inside = name.partition(":")
+    if colon and package.isidentifier() and len(package) > 1:  # one letter is a drive
+        return _packaged(package, inside)
     path = Path(name)
     if not path.is_absolute() or not path.exists():  # else a name that is as it stands, with a $ in it or not
         path = Path(os.path.expandvars(name)).expanduser()
@@ -140,29 +151,31 @@ def find_volume(name: str, folder: Path) -> Path:
     raise ValueError(f"expected a volume file; found none at {looked}{hint}")
 
 
-class SignalSource(StrictModel):
-    """A closed-form signal, exact or sampled.
+def _packaged(package: str, inside: str) -> Path:
+    spec = importlib.util.find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        raise ValueError(f"expected the installed package {package!r}; it is not here (pip install {package})")
+    path = Path(spec.submodule_search_locations[0]) / inside
+    if not path.is_file():
+        raise ValueError(f"expected a file of the package {package}; it has no {inside!r}")
+    return path
+
+
+class SignalModel(StrictModel):
+    """A closed-form signal; a bare name stands for its default parameters.
 
     Attributes:
         name: a name from `filterlab.signals.SIGNALS`.
         parameters: of that signal, by name.
-        samples: n (or nx, ny, nz) voxels to sample it on, for a method to reconstruct; left out, the signal itself.
     """
 
     name: Annotated[str, AfterValidator(_known_signal)]
     parameters: Annotated[Parameters, Field(default_factory=dict)]
-    samples: Annotated[int, Field(ge=1, le=2048)] | Annotated[tuple[int, int, int], _Listed] | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _from_name(cls, value: Any) -> Any:
         return _named(value)
-
-    @model_validator(mode="after")
-    def _accepted(self) -> SignalSource:
-        if isinstance(self.samples, tuple) and min(self.samples) < 1:
-            raise ValueError(f"samples must be positive; got {self.samples}")
-        return self
 
     @field_validator("parameters")
     @classmethod
@@ -175,28 +188,104 @@ class SignalSource(StrictModel):
         """The signal."""
         return signals.named(self.name, **self.parameters)  # type: ignore[arg-type]
 
+    def finite(self) -> signals.Signal:
+        """The signal. Raises ValueError unless it is finite at a point like any other."""
+        told = f"expected parameters with which {self.name} is finite; got {self.parameters}"
+        try:
+            signal = self.build()
+            point = torch.tensor([signal.domain.center], dtype=torch.float64) + 0.1 * signal.domain.voxel_size
+            found = signal.value_and_gradient(point)
+        except (ArithmeticError, RuntimeError, TypeError) as error:
+            raise ValueError(f"{told} ({error})") from None
+        if not all(bool(x.isfinite().all()) for x in found):
+            raise ValueError(told)
+        return signal
+
+    @property
+    def label(self) -> str:
+        """The name with its parameters, e.g. `gaussian (sigma 0.2)`."""
+        listed = ", ".join(f"{k} {list(v) if isinstance(v, tuple) else v}" for k, v in self.parameters.items())
+        return f"{self.name} ({listed})" if listed else self.name
+
+
+class SignalSource(SignalModel):
+    """A signal that is shown, exact or sampled.
+
+    Attributes:
+        samples: n (or nx, ny, nz) voxels to sample it on, for a method to reconstruct; left out, the signal itself.
+    """
+
+    samples: Annotated[int, Field(ge=1, le=2048)] | Annotated[tuple[int, int, int], _Listed] | None = None
+
+    @model_validator(mode="after")
+    def _accepted(self) -> Self:
+        if isinstance(self.samples, tuple) and min(self.samples) < 1:
+            raise ValueError(f"samples must be positive; got {self.samples}")
+        self.finite()
+        return self
+
 
 def _check_parameters(name: str, parameters: Parameters) -> None:
-    """Raises ValueError for a parameter that the signal does not have, of another kind, or that gives no numbers."""
+    """Raises ValueError for a parameter that the signal does not have, of another kind, or that it refuses."""
     known = inspect.signature(signals.SIGNALS[name]).parameters
     for parameter, value in parameters.items():
         if parameter not in known:
             raise ValueError(unknown_name(f"parameter of {name}", parameter, known))
         expected = "three numbers [x, y, z]" if isinstance(known[parameter].default, tuple) else "a number"
-        if isinstance(value, tuple) != isinstance(known[parameter].default, tuple):
+        vector = isinstance(value, tuple)
+        if vector != isinstance(known[parameter].default, tuple) or (vector and len(value) != 3):
             raise ValueError(f"{parameter}: expected {expected}; got {value}")
-    try:
-        signal = signals.named(name, **parameters)  # type: ignore[arg-type]
-        point = torch.tensor([signal.domain.center], dtype=torch.float64) + 0.1  # nothing special about it
-        finite = all(bool(x.isfinite().all()) for x in signal.value_and_gradient(point))
-    except (ArithmeticError, RuntimeError, TypeError) as error:
-        raise ValueError(f"expected parameters with which {name} can be computed; got {parameters} ({error})") from None
-    if not finite:
-        raise ValueError(f"expected parameters with which {name} is finite; got {parameters}")
+    signals.named(name, **parameters)  # type: ignore[arg-type]
 
 
 class Reconstruction(StrictModel):
     """How samples become a field; a bare name stands for a method as it is. See `filterlab.reconstruct`.
+
+    Attributes:
+        name: of a method.
+        scheme: left out, the fastest that runs.
+    """
+
+    name: Annotated[str, AfterValidator(_known_method)]
+    prefilter: bool = True
+    gradient: Literal["analytic", "central"] | None = None
+    scheme: str | None = None
+    sampler: Literal["exact", "texture_unit"] = "exact"
+    storage: StorageName | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        if isinstance(value, Mapping) and "method" in value:
+            raise ValueError("the key method is called name here: write {name: " + f"{value['method']}, …" + "}")
+        return _named(value)
+
+    @model_validator(mode="after")
+    def _offered(self) -> Self:
+        self._method.scheme(self.scheme, self.gradient, self.sampler)
+        return self
+
+    @property
+    def _method(self) -> Method:
+        return METHODS[self.name]
+
+    def build(self, volume: Volume, boundary: str = "mirror", nan: str = "refuse") -> FilterlabField:
+        """The field."""
+        return reconstruct(
+            volume,
+            self.name,
+            boundary=boundary,
+            prefilter=self.prefilter,
+            gradient=self.gradient,
+            scheme=self.scheme,
+            sampler=self.sampler,
+            storage=self.storage,
+            nan=nan,
+        )
+
+
+class SceneMethod(Reconstruction):
+    """The method of a scene, and what it does at the volume's ends and where there are no values.
 
     Attributes:
         name: of a method, or `auto`: the cheapest one whose error on this volume stays within a budget, with the
@@ -204,52 +293,30 @@ class Reconstruction(StrictModel):
         max_error: that budget, in parts of the range of the volume's values; only with `auto`.
     """
 
-    name: Annotated[str, AfterValidator(_known_method)] = "triquadratic"
+    name: Annotated[str, AfterValidator(_known_method_or_auto)] = "triquadratic"
     max_error: Annotated[float, BeforeValidator(_part), Field(gt=0)] | None = None
-    prefilter: bool = True
-    scheme: str | None = None
     boundary: Annotated[str, AfterValidator(_known_boundary)] = "mirror"
-    gradient: str | None = None
-    sampler: Literal["exact", "texture_unit"] = "exact"
-    storage: StorageName | None = None
     nan: NanChoice = "refuse"
 
-    @model_validator(mode="before")
-    @classmethod
-    def _from_name(cls, value: Any) -> Any:
-        return _named(value)
-
     @model_validator(mode="after")
-    def _offered(self) -> Reconstruction:
+    def _offered(self) -> Self:
         if (self.name == AUTO) != (self.max_error is not None):
             raise ValueError(f"max_error goes with the name {AUTO}, and only with that; got {self.name}")
-        if self.name == AUTO:
-            settled = {"prefilter", "scheme", "gradient", "sampler", "storage"} & self.model_fields_set
-            if settled:
-                raise ValueError(f"{AUTO} settles {', '.join(sorted(settled))}; leave it out, or name a method")
-            return self
-        METHODS[self.name].scheme(self.scheme, self.gradient, self.sampler)
+        if self.name != AUTO:
+            self._method.scheme(self.scheme, self.gradient, self.sampler)
+        elif settled := {"prefilter", "scheme", "gradient", "sampler", "storage"} & self.model_fields_set:
+            raise ValueError(f"{AUTO} settles {', '.join(sorted(settled))}; leave it out, or name a method")
         return self
 
-    def build(self, volume: Volume) -> FilterlabField:
-        """The field."""
-        return reconstruct(
-            volume,
-            self.name,
-            boundary=self.boundary,
-            prefilter=self.prefilter,
-            scheme=self.scheme,
-            gradient=self.gradient,
-            sampler=self.sampler,
-            storage=self.storage,
-            nan=self.nan,
-        )
+    def build(self, volume: Volume, boundary: str | None = None, nan: str | None = None) -> FilterlabField:
+        """The field, by default with the scene's own boundary and choice of NaN."""
+        return super().build(volume, boundary or self.boundary, nan or self.nan)
 
 
 # --- how it is shown --------------------------------------------------------------------------------------------------
 
 
-class Point(StrictModel):
+class ControlPoint(StrictModel):
     """A control point of a transfer function: what a value looks like."""
 
     value: float
@@ -275,7 +342,7 @@ class Transfer(StrictModel):
         unit: world length that the opacities are for; default one voxel (the shortest edge).
     """
 
-    points: Annotated[list[Point], Field(min_length=1)] | None = None
+    points: Annotated[list[ControlPoint], Field(min_length=1)] | None = None
     peaks: Annotated[list[Peak], Field(min_length=1)] | None = None
     axis: Literal["raw", "normalized"] = "raw"
     unit: Positive | None = None
@@ -301,7 +368,7 @@ class Transfer(StrictModel):
         )
 
 
-class View(StrictModel):
+class CameraView(StrictModel):
     """Where the camera is: at a pose, or looking along a direction from where the whole domain is in view.
 
     Attributes:
@@ -326,7 +393,7 @@ class View(StrictModel):
     window: Window = WHOLE
 
     @model_validator(mode="after")
-    def _consistent(self) -> View:
+    def _consistent(self) -> CameraView:
         if (self.position is None) != (self.target is None):
             raise ValueError("expected position and target together; got one of them")
         if self.position is not None and self.direction is not None:
@@ -418,9 +485,9 @@ class Scene(StrictModel):
     description: str = ""
     volume: VolumeFile | None = None
     signal: SignalSource | None = None
-    method: Reconstruction | None = None
+    method: SceneMethod | None = None
     transfer: Transfer
-    camera: View = View()
+    camera: CameraView = CameraView()
     size: tuple[Pixels, Pixels] = (512, 512)
     step: Positive | None = None
     lighting: Lighting | None = None
@@ -430,6 +497,13 @@ class Scene(StrictModel):
     termination: Annotated[float, Field(gt=0, lt=1)] | None = None
     precision: Literal["float32", "float64"] = "float32"
     device: str = "cpu"
+
+    @field_validator("volume")
+    @classmethod
+    def _found(cls, volume: VolumeFile | None, info: ValidationInfo) -> VolumeFile | None:
+        """Looked for when the scene is read: nothing is computed before every file is known to be there."""
+        folder = Path((info.context or {}).get("folder", "."))
+        return None if volume is None else volume.model_copy(update={"file": str(volume.path(folder))})
 
     @model_validator(mode="after")
     def _consistent(self) -> Scene:
@@ -450,114 +524,3 @@ class Scene(StrictModel):
     def step_or_default(self) -> float:
         """In voxels."""
         return STEP if self.step is None else self.step
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A scene with everything built: what `render` takes.
-
-    Attributes:
-        scene: with `method: auto` replaced by what was found.
-        volume_bytes: of the samples; 0 for a signal that is not sampled.
-        chosen: how `method: auto` came to its choice, in sentences; else nothing.
-    """
-
-    scene: Scene
-    field: FilterlabField
-    camera: Camera
-    transfer: TransferFunction
-    options: dict[str, Any]
-    volume_bytes: int = 0
-    chosen: tuple[str, ...] = ()
-
-    def render(self, progress: Progress = False) -> Tensor:
-        """The image `(H, W, 4)`, as `filterlab.render.render` gives it."""
-        return render(self.field, self.camera, self.transfer, progress=progress, **self.options)
-
-
-def load_scene(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Scene:
-    """The scene in a YAML file, with some of its keys set anew ({"camera.window": "[0, 0, 0.5, 0.5]"}).
-
-    Raises:
-        ConfigError: every problem with its line, the path of the key and, for names, the known ones. Volume files are
-            found here, before anything is computed.
-    """
-    return load_config(path, Scene, overrides)
-
-
-def build(scene: Scene) -> Prepared:
-    """Loads or samples what the scene shows, reconstructs it and builds camera, transfer function and lights.
-
-    Raises ValueError where `method: auto` finds nothing within its budget, with the best there is.
-    """
-    volume = _volume(scene)
-    scene, chosen = settled(scene, volume)
-    if volume is None:
-        assert scene.signal is not None
-        signal = scene.signal.build()
-        field, value_range = signal, lambda: _range(signal.sample(64).samples)
-    else:
-        field = (scene.method or Reconstruction()).build(volume)
-        value_range = partial(_range, volume.samples)
-    options = {
-        "size": scene.size,
-        "step": scene.step_or_default,
-        "shading": scene.lighting.build() if scene.lighting else None,
-        "background": scene.background,
-        "region": scene.region.build() if scene.region else None,
-        "jitter_seed": scene.jitter,
-        "termination": scene.termination,
-        "dtype": scene.dtype,
-        "device": scene.device,
-    }
-    transfer = scene.transfer.build(value_range, field.domain.voxel_size)
-    camera = scene.camera.build(field.domain, scene.size)
-    return Prepared(scene, field, camera, transfer, options, 0 if volume is None else volume.samples.nbytes, chosen)
-
-
-def render_scene(scene: Scene, progress: Progress = False) -> Tensor:
-    """The picture `(H, W, 3)`: linear RGB over the scene's background, ready for `filterlab.io.save_image`.
-
-    For its opacity as well: `build(scene).render()`.
-    """
-    return build(scene).render(progress)[..., :3]
-
-
-def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]]:
-    """The scene with `method: auto` replaced by what is found on the volume, and how, in sentences."""
-    method = scene.method
-    if volume is None or method is None or method.max_error is None:
-        return scene, ()
-    found = recommend(volume, method.max_error, task="dvr", boundary=method.boundary, nan=method.nan)
-    if found.pick is None:
-        best = report.sentences(found)[-1].removeprefix("The ").removesuffix(".")
-        raise ValueError(f"method: found none within max_error {report.percent(method.max_error)}; the {best}")
-    explicit = Reconstruction(
-        name=found.pick.method,
-        scheme=found.pick.scheme,
-        storage=found.pick.storage,  # type: ignore[arg-type]
-        boundary=method.boundary,
-        nan=method.nan,
-    )
-    step = found.pick.step if scene.step is None else scene.step
-    return scene.model_copy(update={"method": explicit, "step": step}), tuple(report.sentences(found))
-
-
-def _volume(scene: Scene) -> Volume | None:
-    """The samples, in the type and on the device of the scene; None for a signal that is shown as it is."""
-    dtype = scene.dtype
-    if scene.volume is not None:
-        volume = scene.volume.load()
-    else:
-        assert scene.signal is not None
-        if scene.signal.samples is None:
-            return None
-        volume = scene.signal.build().sample(scene.signal.samples, dtype=dtype)
-    if dtype == torch.float64 or volume.dtype == torch.float64:
-        volume = volume.to(dtype)
-    return volume.to(scene.device)
-
-
-def _range(samples: Tensor) -> tuple[float, float]:
-    low, high = samples.aminmax()
-    return float(low), float(high)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,11 +14,11 @@ import torch
 from filterlab.cli import main
 from filterlab.fields.base import Field
 from filterlab.io.config import ConfigError, loads_config
-from filterlab.render import scene as scenes
-from filterlab.render.dvr import prepare
-from filterlab.render.plan import plan
-from filterlab.render.plan_report import table
-from filterlab.render.scene import Prepared, Scene, build
+from filterlab.scenes import build as building
+from filterlab.scenes.build import build
+from filterlab.scenes.model import Scene
+from filterlab.scenes.plan import plan
+from filterlab.scenes.plan_report import table
 
 BASE = """
 signal: {name: sphere, samples: 24}
@@ -55,7 +56,7 @@ def test_a_plan_says_what_the_renderer_does(more: str) -> None:
     prepared = build(scene(more))
     found = plan(prepared)
     counting = Counting(prepared.field)
-    other = Prepared(prepared.scene, counting, prepared.camera, prepared.transfer, prepared.options)
+    other = replace(prepared, field=counting)
     with torch.no_grad():
         other.render()
         told = []
@@ -80,8 +81,8 @@ def test_what_is_skipped_is_what_the_renderer_leaves_out() -> None:
     assert 0.3 < found.skipped < 1
     from filterlab.render.fused import empty_bricks
 
-    job = prepare(prepared.field, prepared.camera, prepared.transfer, **prepared.options)
-    bricks = empty_bricks(job.media[0])
+    frame = prepared.frame()
+    bricks = empty_bricks(frame.media[0])
     assert bricks is not None
     inside = 2 * torch.rand(4000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 1
     lying = inside[bricks.empty(inside)]
@@ -120,12 +121,12 @@ AUTO = BASE.replace("method: triquadratic", "method: {name: auto, max_error: 60%
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Costs are measured for less long, and of fewer methods."""
-    whole = scenes.recommend
+    whole = building.recommend
 
     def recommend(*arguments, **options):
         return whole(*arguments, methods=["trilinear", "notch"], seconds=0.05, **options)
 
-    monkeypatch.setattr(scenes, "recommend", recommend)
+    monkeypatch.setattr(building, "recommend", recommend)
 
 
 def test_auto_is_the_scene_that_it_stands_for() -> None:
@@ -134,14 +135,14 @@ def test_auto_is_the_scene_that_it_stands_for() -> None:
     assert method is not None
     assert method.name in ("trilinear", "notch")
     assert method.max_error is None
-    assert prepared.scene.step == prepared.options["step"] == 1.0
+    assert prepared.scene.step == prepared.sampling.step == 1.0
     with torch.no_grad():
         assert torch.equal(prepared.render(), build(prepared.scene).render())
     assert any("Recommended" in sentence for sentence in plan(prepared).chosen)
 
 
 def test_a_step_of_the_scene_is_kept() -> None:
-    assert build(loads_config(AUTO + "step: 0.3\n", Scene)).options["step"] == 0.3
+    assert build(loads_config(AUTO + "step: 0.3\n", Scene)).sampling.step == 0.3
 
 
 def test_auto_says_when_nothing_is_within_the_budget() -> None:
@@ -188,6 +189,7 @@ import torch
 from filterlab.methods import reconstruct
 from filterlab.render import PerspectiveCamera, TransferFunction
 from filterlab.render.dvr import prepare
+from filterlab.render.sampling import Sampling
 
 def status(name):
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
@@ -195,14 +197,14 @@ def status(name):
 
 field = reconstruct(torch.rand(3, 3, 3), "trilinear")
 transfer = TransferFunction([0.0, 1.0], [[1.0, 0.5, 0.2]] * 2, [0.1, 0.2])
-camera, options = PerspectiveCamera.framing(field.domain, margin=3.0), {"step": 10.0, "memory": int(sys.argv[1])}
-prepare(field, camera, transfer, size=(64, 64), **options).run()  # what is compiled is there now
-job = prepare(field, camera, transfer, size=(1200, 1000), **options)
-said, image = (job.image_bytes, job.ray_bytes), None
-del job
+camera, sampling = PerspectiveCamera.framing(field.domain, margin=3.0), Sampling(step=10.0, memory=int(sys.argv[1]))
+prepare(field, camera, transfer, size=(64, 64), sampling=sampling).run()  # what is compiled is there now
+frame = prepare(field, camera, transfer, size=(1200, 1000), sampling=sampling)
+said, image = (frame.image_bytes, frame.ray_bytes), None
+del frame
 Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak begins anew
 before = status("VmRSS")
-image = prepare(field, camera, transfer, size=(1200, 1000), **options).run()
+image = prepare(field, camera, transfer, size=(1200, 1000), sampling=sampling).run()
 print(field.scheme.name, image.nbytes, *said, status("VmHWM") - before)
 """
 

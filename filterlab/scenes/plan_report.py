@@ -6,7 +6,7 @@ from rich.table import Table
 from rich.text import Text
 
 from filterlab.recommendation.report import duration, percent, size
-from filterlab.render.plan import Plan
+from filterlab.scenes.plan import Plan
 
 
 def table(plan: Plan) -> Table:

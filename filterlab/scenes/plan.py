@@ -1,8 +1,8 @@
-"""What a scene will take: derived from the very job that `render` would run, and from a small part of it that is run.
+"""What a scene will take: derived from the very frame that `render` would run, and from a small part of it that is run.
 
-scene ──▶ Prepared ──▶ Job (dvr.prepare) ──▶ rays, segments, derivative order, marcher
-                         │
-                         └─ some of the rays, marched ──▶ time;   their segments in empty bricks ──▶ what is skipped
+scene ──▶ Prepared ──▶ Frame (dvr.prepare) ──▶ rays, segments, derivative order, marcher
+                           │
+                           └─ some of the rays, marched ──▶ time;   their segments in empty bricks ──▶ what is skipped
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from filterlab.fields.grid import GridField
 from filterlab.methods import METHODS
 from filterlab.ops.march import Chords
 from filterlab.ops.reference.march import segments
-from filterlab.render.dvr import Job, prepare
+from filterlab.render.dvr import Frame
 from filterlab.render.fused import FusedMarcher, empty_bricks, why_not_fused
 from filterlab.render.plain import Medium
-from filterlab.render.scene import Prepared, Scene
+from filterlab.scenes.build import Prepared
+from filterlab.scenes.model import Scene
 
 _PROBE_RAYS = 4096
 _PROBE_SEGMENTS = 1 << 21
@@ -84,10 +85,10 @@ def plan(prepared: Prepared) -> Plan:
 
     Takes as long as a few thousand rays do, five times over.
     """
-    job = prepare(prepared.field, prepared.camera, prepared.transfer, **prepared.options)
-    medium, some = job.media[0], _some_rays(job)
-    seconds = _seconds(job, medium, some)
-    empty, skipped = _skipped(job, medium, some)
+    frame = prepared.frame()
+    medium, some = frame.media[0], _some_rays(frame)
+    seconds = _seconds(frame, medium, some)
+    empty, skipped = _skipped(frame, medium, some)
     field = prepared.field
     known = isinstance(field, GridField)
     return Plan(
@@ -96,47 +97,47 @@ def plan(prepared: Prepared) -> Plan:
         storage=str(field.coefficients.values.dtype).removeprefix("torch.") if known else "–",
         taps=METHODS[field.method].facts.taps if known and field.method in METHODS else None,
         order=medium.order,
-        marcher="fused" if isinstance(job.marcher, FusedMarcher) else "plain",
+        marcher="fused" if isinstance(frame.marcher, FusedMarcher) else "plain",
         not_fused=why_not_fused(medium),
-        rays=job.pixels,
-        samples=job.samples,
+        rays=frame.pixels,
+        samples=frame.samples,
         empty_bricks=empty,
         skipped=skipped,
         step=prepared.scene.step_or_default,
         volume_bytes=prepared.volume_bytes,
         coefficient_bytes=coefficient_bytes(field),
-        image_bytes=job.image_bytes,
-        ray_bytes=job.ray_bytes,
+        image_bytes=frame.image_bytes,
+        ray_bytes=frame.ray_bytes,
         seconds=seconds,
         absent=_absent(prepared.scene),
         chosen=prepared.chosen,
     )
 
 
-def _some_rays(job: Job) -> Chords:
+def _some_rays(frame: Frame) -> Chords:
     """Every k-th ray, so many that a few thousand rays or a few million segments are marched."""
-    fewest = max(job.samples // _PROBE_SEGMENTS, job.pixels // _PROBE_RAYS, 1)
+    fewest = max(frame.samples // _PROBE_SEGMENTS, frame.pixels // _PROBE_RAYS, 1)
     first = fewest // 2
-    device = job.media[0].transfer.positions.device
-    return job.chords(torch.arange(min(first, job.pixels - 1), job.pixels, fewest, device=device))
+    device = frame.media[0].transfer.positions.device
+    return frame.chords(torch.arange(min(first, frame.pixels - 1), frame.pixels, fewest, device=device))
 
 
-def _seconds(job: Job, medium: Medium, some: Chords) -> Quartiles:
+def _seconds(frame: Frame, medium: Medium, some: Chords) -> Quartiles:
     """Of all rays of all images, from runs of some; the first run, which compiles, does not count."""
-    share = len(some.count) / (job.pixels * len(job.media))
+    share = len(some.count) / (frame.pixels * len(frame.media))
     taken = []
     for _ in range(_REPEATS + 1):
         start = time.perf_counter()
-        light, _ = job.marcher.march(medium, some, lambda done: None)
+        light, _ = frame.marcher.march(medium, some, lambda done: None)
         if light.device.type == "cuda":
             torch.cuda.synchronize(light.device)
         taken.append((time.perf_counter() - start) / share)
     return Quartiles.of(taken[1:])
 
 
-def _skipped(job: Job, medium: Medium, some: Chords) -> tuple[float | None, float | None]:
+def _skipped(frame: Frame, medium: Medium, some: Chords) -> tuple[float | None, float | None]:
     """(part of the bricks that is empty, part of the segments of some rays whose middles lie in them)."""
-    if not isinstance(job.marcher, FusedMarcher):
+    if not isinstance(frame.marcher, FusedMarcher):
         return None, None
     found = empty_bricks(medium)
     if found is None:
