@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from filterlab.ops.cuda import launch
 from filterlab.ops.cuda import prefilter as fused
 from filterlab.ops.cuda.recursion import BLOCK, STEPS, Columns, Program, Rows
 from filterlab.ops.differentiable import prefilter as op
+from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.prefilter import implementation_for, missing, prefilter_axis, prefilter_samples
 from filterlab.ops.gather import STORAGE
 from filterlab.prefilters import PREFILTERS, Prefilter, interpolation
@@ -171,15 +174,18 @@ def test_nothing_outside_the_arrays_is_read_or_written(shape: tuple[int, ...], d
     """Samples and coefficients between two walls: what stands in them matters to no result, and stays what it was."""
     how = op.Filtering((-2,), PREFILTERS["cubic"], Boundary.ZEROS, 3)
     wall = 8 * math.prod(shape)
-    out = (shape[0], shape[1] + 6, shape[2])
-    memory = [torch.full((2 * wall + math.prod(s),), math.nan, dtype=torch.float64).to(device) for s in (shape, out)]
-    source, target = (m[wall:-wall].view(s) for m, s in zip(memory, (shape, out), strict=True))
+
+    def between_walls(shape: tuple[int, ...], of: float) -> tuple[Tensor, Tensor]:
+        memory = torch.full((2 * wall + math.prod(shape),), of, dtype=torch.float64).to(device)
+        return memory, memory[wall:-wall].view(shape)
+
+    _, source = between_walls(shape, 1e3)
+    memory, target = between_walls((shape[0], shape[1] + 6, shape[2]), math.nan)
     source.copy_(values(*shape))
     fused._launch(source, target, how)
     assert_same(target, prefilter_axis(source.clone(), 1, "cubic", "zeros", 3))
-    for m in memory:
-        assert m[:wall].isnan().all()
-        assert m[-wall:].isnan().all()
+    assert memory[:wall].isnan().all()
+    assert memory[-wall:].isnan().all()
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
@@ -204,7 +210,9 @@ def test_derivatives_of_first_and_second_order_and_forwards(boundary: Boundary, 
 
 
 def test_derivatives_stay_in_the_implementation(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
     monkeypatch.setattr(op.reference, "filter_axes", lambda *a: pytest.fail("the reference was asked"))
+    monkeypatch.setattr(op, "driver", lambda implementation, name: asked.append(implementation) or driver("cuda", name))
     x = values(1, 2, 2, device=device).requires_grad_()
 
     def squared(x: Tensor) -> Tensor:
@@ -213,6 +221,7 @@ def test_derivatives_stay_in_the_implementation(device: str, monkeypatch: pytest
     (first,) = torch.autograd.grad(squared(x), x, create_graph=True)
     torch.autograd.grad(first.square().sum(), x)
     torch.func.jvp(squared, (x.detach(),), (torch.ones_like(x),))
+    assert set(asked) == {"cuda"}
 
 
 def test_a_gradient_comes_in_the_dtype_of_the_samples(device: str) -> None:
@@ -284,6 +293,13 @@ def test_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "_triton_problem", lambda: "the package triton can't be loaded")
     with pytest.raises(ValueError, match="triton"):
         prefilter_samples(x, "cubic", implementation="cuda")
+
+
+def test_every_device_has_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(op, "missing", lambda *_: None)
+    for device, expected in {"cpu": "cpu", "cuda": "cuda", "meta": "reference"}.items():
+        samples: Any = SimpleNamespace(device=torch.device(device))
+        assert implementation_for(samples) == expected
 
 
 def test_fields_of_a_gpu_are_prefiltered_there(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
