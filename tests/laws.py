@@ -88,6 +88,19 @@ def assert_linear(forward: Callable[[Tensor], Tensor], x: Tensor, y: Tensor, tol
     assert_close(forward(2 * x - 3 * y), expected, tolerance, 1 + float(expected.abs().max()))
 
 
+def assert_a_nan_stays_on_its_lines(along: Callable[[Tensor, int], Tensor], x: Tensor) -> None:
+    """One NaN in x (D, H, W): NaN all along its lines through `along(x, axis)`, and the rest bit by bit what it was."""
+    place = tuple(n // 2 for n in x.shape)
+    spoilt = x.clone()
+    spoilt[place] = torch.nan
+    for axis in range(3):
+        line = tuple(slice(None) if a == axis else i for a, i in enumerate(place))
+        found, expected = along(spoilt, axis), along(x, axis)
+        assert found[line].isnan().all()
+        found[line] = expected[line]
+        assert torch.equal(found, expected)
+
+
 def finite_difference(function: Callable[[Tensor], Tensor], points: Tensor, step: float = 1e-3) -> Tensor:
     """d function / d point by the fourth-order difference (8 (f₁ − f₋₁) − (f₂ − f₋₂)) / 12h: `(..., 3)`."""
     columns = []

@@ -10,6 +10,8 @@ pytest.importorskip("triton", reason="the package triton is not installed")
 
 from filterlab import reconstruct, resample
 from filterlab.methods import METHODS
+from filterlab.ops.differentiable.prefilter import implementation_for, prefilter_samples
+from filterlab.prefilters import PREFILTERS
 from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.roots import all_roots, first_root
 from filterlab.volume import Boundary, Volume
@@ -54,6 +56,34 @@ def test_values_gradients_and_derivatives(method: str, scheme: str, boundary: st
             results.append((*jet, *torch.autograd.grad(weighed, (x, p))))
         for of_cpu, of_gpu in zip(*results, strict=True):
             assert_same(of_gpu, of_cpu)
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+@pytest.mark.parametrize("prefilter", [name for name, p in PREFILTERS.items() if not p.is_identity])
+def test_prefilters_and_their_derivatives(prefilter: str, boundary: str) -> None:
+    """By what is chosen on each device."""
+    for shape in ((1, 2, 3), (2, 17, 16, 33), (3, 3, 70, 5)):
+        for dtype in TOLERANCE:
+            results = []
+            for device in ("cpu", "cuda"):
+                x = torch.rand(shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64).to(dtype)
+                x = (2 * x - 1).to(device).requires_grad_()
+                assert implementation_for(x) == device
+                c = prefilter_samples(x, prefilter, boundary, 2, implementation_for(x))
+                results.append((c, *torch.autograd.grad(c.square().sum(), x)))
+            for of_cpu, of_gpu in zip(*results, strict=True):
+                assert_same(of_gpu, of_cpu)
+
+
+def test_a_prefilter_takes_the_result_and_a_copy_of_memory() -> None:
+    """While an axis is filtered, what it is filtered from and what it gives."""
+    x = torch.rand(128, 96, 160, device="cuda")
+    prefilter_samples(x, "cubic", implementation="cuda")  # tables and programs stay
+    torch.cuda.synchronize()
+    before = torch.cuda.memory_allocated()
+    torch.cuda.reset_peak_memory_stats()
+    c = prefilter_samples(x, "cubic", implementation="cuda")
+    assert torch.cuda.max_memory_allocated() - before <= 2 * c.nbytes + (1 << 20)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -8,7 +8,6 @@ are read as they are stored, through any strides but along x; what lies otherwis
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -21,7 +20,6 @@ from filterlab.ops.cpu.memory import ARITHMETIC, fresh
 from filterlab.ops.cpu.recursion import Job, Recipe
 from filterlab.ops.gather import STORAGE
 from filterlab.ops.prefilter import Filtering
-from filterlab.volume import Boundary
 
 _STATES = (
     8  # packs that a bundle's recursions remember, K times the poles; with AVX2 2 are slower by a quarter, so are 16
@@ -55,7 +53,7 @@ class _Filter:
     """One call: the samples and how they are to be filtered."""
 
     def __init__(self, samples: Tensor, dtype: torch.dtype, how: Filtering) -> None:
-        self.samples, self.dtype, self.boundary, self.tail = samples, dtype, how.boundary, how.tail
+        self.samples, self.dtype, self.how, self.tail = samples, dtype, how, how.tail
         self.warm_up = how.prefilter.decay(dtype)
         self.poles = np.array(how.prefilter.poles)
         self.gain = math.prod((1 - z) ** 2 for z in how.prefilter.poles)
@@ -189,7 +187,7 @@ class _Filter:
         return samples if samples.stride(-1) == 1 or samples.shape[-1] == 1 else samples.contiguous()
 
     def _places(self, n: int) -> Tensor:
-        return _places(self.boundary, n, self.tail + self.warm_up)
+        return self.how.places(n, self.warm_up, self.warm_up)
 
     def _threads(self, numbers: int) -> int:
         return threads_for(numbers, _NUMBERS_PER_THREAD)
@@ -206,14 +204,6 @@ def _scratch(size: int) -> np.ndarray:
     memory = np.empty(size + _ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % _ALIGNMENT
     return memory[start : start + size]
-
-
-@lru_cache(maxsize=64)
-def _places(boundary: Boundary, n: int, beyond: int) -> Tensor:
-    """The sample at each place from −beyond to n−1+beyond, −1 for a zero."""
-    index = torch.arange(-beyond, n + beyond)
-    places = boundary.source(index, n)
-    return torch.where((index >= 0) & (index < n), places, -1) if boundary is Boundary.ZEROS else places
 
 
 def _rounded(number: int, multiple: int) -> int:

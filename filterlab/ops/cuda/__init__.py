@@ -1,10 +1,10 @@
-"""Every op in Triton: one program per stencil, compiled for the GPU at its first use.
+"""Every op in Triton: one program per stencil (the prefilter's: per number of poles), compiled at its first use.
 
-`gather` and `march` describe arrays to programs and launch them; `points`, `compositing` and `adjoint` write those
-programs, from the sums of `taps` (read it first) and what `segments` knows of rays; `launch` hands their text to
-Triton, which keeps what it has compiled on disk. With TRITON_INTERPRET=1 in the environment the same programs run on
-tensors of the CPU, in Triton's interpreter: slowly, to test them where there is no GPU. What is here can be asked
-without Triton: whether they can run at all.
+`gather`, `prefilter` and `march` describe arrays to programs and launch them; `points`, `recursion`, `compositing` and
+`adjoint` write those programs, from the sums of `taps` (read it first) and what `segments` knows of rays; `launch`
+hands their text to Triton, which keeps what it has compiled on disk. With TRITON_INTERPRET=1 in the environment the
+same programs run on tensors of the CPU, in Triton's interpreter: slowly, to test them where there is no GPU. What is
+here can be asked without Triton: whether they can run at all.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def missing(
         shape: (D, H, W) of the result of scatter.
         start: the coordinate of coefficient 0.
     """
-    if problem := _triton_problem():
-        return problem
-    if problem := _device_problem(coefficients, points):
+    if coefficients.device != points.device:
+        return f"it works on tensors of one device; got {coefficients.device} and {points.device}"
+    if problem := device_problem(points):
         return problem
     if problem := unsupported(coefficients, points, stencil, shape):
         return problem
@@ -58,11 +58,12 @@ def _triton_problem() -> str | None:
     return None
 
 
-def _device_problem(coefficients: Tensor, points: Tensor) -> str | None:
+def device_problem(tensor: Tensor) -> str | None:
+    """What keeps programs from running where this tensor is; None: nothing does."""
+    if problem := _triton_problem():
+        return problem
     from filterlab.ops.cuda.launch import interpreting
 
-    if coefficients.device != points.device:
-        return f"it works on tensors of one device; got {coefficients.device} and {points.device}"
-    if points.device.type == "cuda" or (points.device.type == "cpu" and interpreting()):
+    if tensor.device.type == "cuda" or (tensor.device.type == "cpu" and interpreting()):
         return None
-    return f"it works on tensors of a GPU (of the CPU with TRITON_INTERPRET=1); got {points.device}"
+    return f"it works on tensors of a GPU (of the CPU with TRITON_INTERPRET=1); got {tensor.device}"

@@ -2,5 +2,6 @@
 
 `recording` tells whether derivatives are asked at all; `gather`, `place`, `prefilter` and `march` have one shape: which
 implementations there are and what each lacks, then the `autograd.Function`, then what callers call; `evaluation` is
-place and gather in one, settled when a field is built; `operators` are the same for torch.compile.
+place and gather in one, settled when a field is built; `operators` are the same for torch.compile; `drivers` imports
+what an implementation computes with.
 """

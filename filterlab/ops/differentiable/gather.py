@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from filterlab import forking
 from filterlab.ops import cpu, cuda
+from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.gather import MAX_ORDER
 from filterlab.ops.reference import gather as reference
@@ -41,45 +40,31 @@ class Implementation:
     """A way to compute gather and scatter.
 
     Attributes:
-        load: imports what computes them; what that needs is asked of `missing` first.
+        name: of the room that has what computes them; what that needs is asked of `missing` first.
         missing: what keeps it from running as asked; None: it runs everything.
         max_order: of a stencil; None: any.
         pulls: whether it has the adjoint to the points in one pass, of stencils below `max_order`.
     """
 
-    load: Callable[[], Any]
+    name: str
     missing: Callable[..., str | None] | None = None
     max_order: int | None = None
     pulls: bool = False
 
-    @cached_property
+    @property
     def sums(self) -> Any:
         """What computes it, imported at its first use."""
-        return self.load()
+        return driver(self.name, "gather")
 
     def of(self, stencil: Stencil) -> Sums:
         """What computes this stencil: the reference where its order is too high."""
         return reference if self.max_order is not None and stencil.order > self.max_order else self.sums
 
 
-def _on_the_cpu() -> Any:
-    with forking.lock:
-        from filterlab.ops.cpu import gather  # it needs llvmlite
-
-    return gather
-
-
-def _on_a_gpu() -> Any:
-    with forking.lock:
-        from filterlab.ops.cuda import gather  # it needs Triton
-
-    return gather
-
-
 IMPLEMENTATIONS: dict[str, Implementation] = {
-    "reference": Implementation(lambda: reference),
-    "cpu": Implementation(_on_the_cpu, cpu.missing, MAX_ORDER, pulls=True),
-    "cuda": Implementation(_on_a_gpu, cuda.missing, MAX_ORDER),
+    "reference": Implementation("reference"),
+    "cpu": Implementation("cpu", cpu.missing, MAX_ORDER, pulls=True),
+    "cuda": Implementation("cuda", cuda.missing, MAX_ORDER),
 }
 
 

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from types import ModuleType
 
 import torch
 from torch import Tensor
 
-from filterlab import forking
 from filterlab.ops import cpu, cuda
+from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.gather import gather
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.march import MAX_LIGHTS, Bricks, March
@@ -37,18 +37,6 @@ Preparation = Callable[[Mapping[str, Tensor]], March]
 def implementation_for(coefficients: Tensor) -> str:
     """What marches rays through these coefficients: "cpu" (vector code), or "cuda" (Triton) on a GPU."""
     return "cuda" if coefficients.device.type == "cuda" else "cpu"
-
-
-@cache
-def _loaded(implementation: str) -> ModuleType:
-    with forking.lock:
-        if implementation == "cuda":
-            from filterlab.ops.cuda import march as on_a_gpu  # it needs Triton
-
-            return on_a_gpu
-        from filterlab.ops.cpu import march as on_the_cpu  # it needs llvmlite
-
-        return on_the_cpu
 
 
 def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dtype, lights: int) -> str | None:
@@ -72,7 +60,7 @@ def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dty
 
 def run(given: March, report: Report = lambda rays: None, implementation: str | None = None) -> tuple[Tensor, Tensor]:
     """Light (R, 3) and optical depth (R,), float64, without derivatives; by default on the device of the tensors."""
-    return _loaded(implementation or implementation_for(given.coefficients)).march(given, report)
+    return _driver(given, implementation).march(given, report)
 
 
 def adjoint(
@@ -98,7 +86,11 @@ def adjoint(
     """
     gradients = tuple(name for name in GRADIENTS if name in wanted)
     arrays = {"light": light, "light_cotangent": light_cotangent, "depth_cotangent": depth_cotangent}
-    return _loaded(implementation or implementation_for(given.coefficients)).adjoint(given, gradients, arrays, report)
+    return _driver(given, implementation).adjoint(given, gradients, arrays, report)
+
+
+def _driver(given: March, implementation: str | None) -> ModuleType:
+    return driver(implementation or implementation_for(given.coefficients), "march")
 
 
 def march(

@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from types import ModuleType
 
 import torch
 from torch import Tensor
 
-from filterlab import forking
+from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.place import Placed, Placement
 from filterlab.ops.reference import place as reference
 
 
 def _on_the_cpu(points: Tensor, placement: Placement) -> Placed:
-    return _driver().place(points, placement)
-
-
-@cache
-def _driver() -> ModuleType:
-    with forking.lock:
-        from filterlab.ops.cpu import place as driver  # it needs llvmlite
-
-    return driver
+    return driver("cpu", "place").place(points, placement)
 
 
 IMPLEMENTATIONS: dict[str, Callable[[Tensor, Placement], Placed]] = {

@@ -1,7 +1,8 @@
 """From samples to coefficients: the prefilter as an operation that can be differentiated.
 
-`prefilter_axis` filters along one axis, `prefilter_samples` along x, y and z. Two implementations: "reference" is plain
-torch, one recursion after the other; "cpu" is fused vector code (`ops.cpu.recursion`). They agree to rounding.
+`prefilter_axis` filters along one axis, `prefilter_samples` along x, y and z. Three implementations: "reference" is
+plain torch, one recursion after the other; "cpu" is fused vector code (`ops.cpu.recursion`), "cuda" a Triton program
+(`ops.cuda.recursion`). They agree to rounding.
 
 With E the extension of a line by its boundary's rule, F = Π gain Lᵀ L the recursions (L the causal one as a matrix) and
 C, which drops the warm-up at both ends, coefficients are c = C F E f. F is its own adjoint, so that of the whole is
@@ -13,15 +14,14 @@ F again, under the boundary `zeros`, for which E and C only pad and crop. So der
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
-from types import ModuleType
 
 import torch
 from torch import Tensor
 
-from filterlab import forking
-from filterlab.ops import cpu
+from filterlab.ops import cpu, cuda
+from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import plain
 from filterlab.ops.gather import STORAGE
 from filterlab.ops.prefilter import VOLUME, Filtering
@@ -29,15 +29,28 @@ from filterlab.ops.reference import prefilter as reference
 from filterlab.prefilters import Prefilter, named
 from filterlab.volume import Boundary
 
-IMPLEMENTATIONS = ("reference", "cpu")
 
-
-def missing(samples: Tensor) -> str | None:
-    """What keeps the implementation "cpu" from filtering these samples; None: nothing does."""
+def _cpu_problem(samples: Tensor) -> str | None:
     if problem := cpu.llvmlite_problem():
         return problem
-    if samples.device.type != "cpu" or samples.layout != torch.strided:
-        return f"it works on dense tensors of the CPU; got {samples.layout} on {samples.device}"
+    return None if samples.device.type == "cpu" else f"it works on tensors of the CPU; got {samples.device}"
+
+
+_PLACES: dict[str, Callable[[Tensor], str | None]] = {"cpu": _cpu_problem, "cuda": cuda.device_problem}
+"""The fused ones, and what keeps each from running where a tensor is."""
+
+IMPLEMENTATIONS = ("reference", *_PLACES)
+
+FUSED = {"cpu": "cpu", "cuda": "cuda"}
+"""Which of them is for a device, by its type."""
+
+
+def missing(samples: Tensor, implementation: str) -> str | None:
+    """What keeps a fused implementation, "cpu" or "cuda", from filtering these samples; None: nothing does."""
+    if problem := _PLACES[implementation](samples):
+        return problem
+    if samples.layout != torch.strided:
+        return f"it works on dense tensors; got {samples.layout}"
     if type(samples) not in (Tensor, torch.nn.Parameter):
         return f"it reads memory, which a {type(samples).__name__} may not have"
     if samples.dtype not in STORAGE:
@@ -46,8 +59,11 @@ def missing(samples: Tensor) -> str | None:
 
 
 def implementation_for(samples: Tensor) -> str:
-    """The fastest implementation for these samples: "cpu" where it can run, else "reference"."""
-    return "reference" if torch.compiler.is_compiling() or missing(samples) else "cpu"
+    """The fastest implementation for these samples: the fused one of their device where it can run, or "reference"."""
+    fused = FUSED.get(samples.device.type)
+    if fused is None or torch.compiler.is_compiling() or missing(samples, fused):
+        return "reference"
+    return fused
 
 
 def prefilter_axis(
@@ -66,7 +82,7 @@ def prefilter_axis(
         prefilter: a name from `PREFILTERS` or a `Prefilter`.
         boundary: how the samples go on beyond the ends.
         tail: coefficients to return beyond each end (border and zeros need them; see the head of `prefilters`).
-        implementation: "reference" (plain torch) or "cpu" (fused; `missing` says what it needs).
+        implementation: "reference" (plain torch), "cpu" or "cuda" (fused; `missing` says what they need).
 
     Returns:
         the coefficients, `samples.shape` with n + 2·tail along `dim`. Linear in the samples; differentiable any number
@@ -78,8 +94,8 @@ def prefilter_axis(
     """
     if not -samples.ndim <= dim < samples.ndim:
         raise ValueError(f"dim must be an axis of the samples, {-samples.ndim} … {samples.ndim - 1}; got {dim}")
-    dims = (dim % samples.ndim - samples.ndim,)
-    return _prefiltered(samples, dims, prefilter, boundary, tail, implementation)
+    how = Filtering((dim % samples.ndim - samples.ndim,), named(prefilter), Boundary.named(boundary), tail)
+    return _prefiltered(samples, how, implementation)
 
 
 def prefilter_samples(
@@ -104,76 +120,60 @@ def prefilter_samples(
     """
     if samples.ndim < 3:
         raise ValueError(f"samples must have shape (..., D, H, W); got {tuple(samples.shape)}")
-    return _prefiltered(samples, VOLUME, prefilter, boundary, tail, implementation)
+    how = Filtering(VOLUME, named(prefilter), Boundary.named(boundary), tail)
+    return _prefiltered(samples, how, implementation)
 
 
-def _prefiltered(
-    samples: Tensor,
-    dims: tuple[int, ...],
-    prefilter: str | Prefilter,
-    boundary: str | Boundary,
-    tail: int,
-    implementation: str,
-) -> Tensor:
-    how = Filtering(dims, named(prefilter), Boundary.named(boundary), tail)
-    if any(samples.shape[dim] == 0 for dim in dims):
+def _prefiltered(samples: Tensor, how: Filtering, implementation: str) -> Tensor:
+    if any(samples.shape[dim] == 0 for dim in how.dims):
         raise ValueError(f"an axis that is filtered needs at least one sample; got shape {tuple(samples.shape)}")
-    if tail < 0:
-        raise ValueError(f"tail must be ≥ 0; got {tail}")
+    if how.tail < 0:
+        raise ValueError(f"tail must be ≥ 0; got {how.tail}")
     if implementation not in IMPLEMENTATIONS:
         raise ValueError(f"implementation must be one of {', '.join(IMPLEMENTATIONS)}; got {implementation!r}")
-    if implementation == "cpu":
-        if why := missing(samples):
-            raise ValueError(f"implementation 'cpu' can't run here: {why}; implementation='reference' can")
-        if not how.prefilter.is_identity:
-            return _fused(samples, how)
-    return reference.filter_axes(samples, how)
+    if implementation == "reference":
+        return reference.filter_axes(samples, how)
+    if why := missing(samples, implementation):
+        raise ValueError(f"implementation {implementation!r} can't run here: {why}; implementation='reference' can")
+    return reference.filter_axes(samples, how) if how.prefilter.is_identity else _fused(samples, how, implementation)
 
 
 class _Prefilter(torch.autograd.Function):
-    """(samples, how) -> coefficients, fused."""
+    """(samples, how, implementation) -> coefficients, fused."""
 
     @staticmethod
-    def forward(samples: Tensor, how: Filtering) -> Tensor:
-        return _compute(samples, how)
+    def forward(samples: Tensor, how: Filtering, implementation: str) -> Tensor:
+        return _compute(samples, how, implementation)
 
     @staticmethod
     def setup_context(ctx, inputs, output) -> None:
-        samples, ctx.how = inputs
+        samples, ctx.how, ctx.implementation = inputs
         ctx.shape = samples.shape
 
     @staticmethod
     def backward(ctx, *gradients: Tensor):
-        return _adjoint(gradients[0], ctx.shape, ctx.how), None
+        return _adjoint(gradients[0], ctx.shape, ctx.how, ctx.implementation), None, None
 
     @staticmethod
     def jvp(ctx, *tangents):
-        return _fused(tangents[0], ctx.how)
+        return _fused(tangents[0], ctx.how, ctx.implementation)
 
     @staticmethod
-    def vmap(info, in_dims, samples: Tensor, how: Filtering):
-        return _fused(samples.movedim(in_dims[0], 0), how), 0
+    def vmap(info, in_dims, samples: Tensor, how: Filtering, implementation: str):
+        return _fused(samples.movedim(in_dims[0], 0), how, implementation), 0
 
 
-def _fused(samples: Tensor, how: Filtering) -> Tensor:
+def _fused(samples: Tensor, how: Filtering, implementation: str) -> Tensor:
     if plain(samples):
-        return _compute(samples, how)
-    return _Prefilter.apply(samples, how)  # type: ignore[return-value]
+        return _compute(samples, how, implementation)
+    return _Prefilter.apply(samples, how, implementation)  # type: ignore[return-value]
 
 
-def _compute(samples: Tensor, how: Filtering) -> Tensor:
-    return _fused_driver().filter_axes(samples, how)
+def _compute(samples: Tensor, how: Filtering, implementation: str) -> Tensor:
+    return driver(implementation, "prefilter").filter_axes(samples, how)
 
 
-@cache
-def _fused_driver() -> ModuleType:
-    with forking.lock:
-        from filterlab.ops.cpu import prefilter as fused  # it needs llvmlite
-
-    return fused
-
-
-def _adjoint(cotangents: Tensor, shape: torch.Size, how: Filtering) -> Tensor:
+def _adjoint(cotangents: Tensor, shape: torch.Size, how: Filtering, implementation: str) -> Tensor:
     """Back to the shape of the samples.
 
     A periodic boundary goes on in the coefficients as it does in the samples: what was given beyond the ends is folded
@@ -184,17 +184,18 @@ def _adjoint(cotangents: Tensor, shape: torch.Size, how: Filtering) -> Tensor:
     """
     dims, boundary, tail = how.dims, how.boundary, how.tail
     if boundary is Boundary.ZEROS:
-        return _fused(cotangents, replace(how, tail=-tail))
+        return _fused(cotangents, replace(how, tail=-tail), implementation)
     if boundary.periodic:
         mirrored = boundary is Boundary.MIRROR
         out = cotangents.clone() if tail or mirrored else cotangents  # to be written to
         for dim in dims if tail else ():
             out = _fold(out, dim, boundary, shape[dim], tail)
+        folded = replace(how, tail=0)
         if not mirrored:
-            return _fused(out, replace(how, tail=0))
-        return _at_mirrors(_own(_fused(_at_mirrors(out, dims, 2.0), replace(how, tail=0))), dims, 0.5)
+            return _fused(out, folded, implementation)
+        return _at_mirrors(_own(_fused(_at_mirrors(out, dims, 2.0), folded, implementation)), dims, 0.5)
     beyond = how.prefilter.decay(cotangents.dtype)
-    out = _own(_fused(cotangents, replace(how, boundary=Boundary.ZEROS, tail=beyond)))
+    out = _own(_fused(cotangents, replace(how, boundary=Boundary.ZEROS, tail=beyond), implementation))
     for dim in dims:
         out = _fold(out, dim, boundary, shape[dim], tail + beyond)
     return out
