@@ -29,7 +29,9 @@ from collections.abc import Sequence
 from filterlab.ops.cuda.source import Source
 
 BLOCK = 32  # lines of a program; a warp
-STEPS = 16  # places that are under way at a time; a power of two
+STEPS = 32
+"""Places that are under way at a time; a power of two. Of 256³ float32 on an H100 16 take 1.2 times as long along y and
+z, 1.5 times along x."""
 SIZES = (
     "lines",
     "inner",  # lines that are neighbours in memory; the next ones lie a whole block of them further
