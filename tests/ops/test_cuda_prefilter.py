@@ -18,7 +18,7 @@ from filterlab.kernels import bspline
 from filterlab.ops import cuda
 from filterlab.ops.cuda import launch
 from filterlab.ops.cuda import prefilter as fused
-from filterlab.ops.cuda.recursion import BLOCK, STEPS, Columns, Program, Rows
+from filterlab.ops.cuda.recursion import BLOCK, Columns, Program, Rows, steps_of
 from filterlab.ops.differentiable import prefilter as op
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.prefilter import implementation_for, missing, prefilter_axis, prefilter_samples
@@ -29,6 +29,7 @@ from tests import laws, oracles
 
 FILTERS = [name for name, prefilter in PREFILTERS.items() if not prefilter.is_identity]
 TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-14}  # of the largest coefficient
+STEPS = steps_of(1)
 LENGTHS = [1, 2, 3, STEPS - 1, STEPS, STEPS + 1, 3 * STEPS + 2]
 every_boundary = pytest.mark.parametrize("boundary", Boundary)
 
@@ -251,7 +252,8 @@ def test_vmap_equals_a_loop(boundary: str, device: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("lines", "places", "stored", "real"), [(Rows, (1, STEPS), "u8", "fp32"), (Columns, (STEPS,), "fp64", "fp64")]
+    ("lines", "places", "stored", "real"),
+    [(Rows, (1, steps_of(2)), "u8", "fp32"), (Columns, (steps_of(2),), "fp64", "fp64")],
 )
 def test_compiles_for_a_gpu_that_need_not_be_there(
     lines: type[Program], places: tuple[int, ...], stored: str, real: str, monkeypatch: pytest.MonkeyPatch, tmp_path
@@ -264,7 +266,7 @@ def test_compiles_for_a_gpu_that_need_not_be_there(
 
     monkeypatch.setenv("TRITON_INTERPRET", "0")
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
-    program = launch.launchable(lines(2).write())
+    program, steps = launch.launchable(lines(2).write()), steps_of(2)
     types = {"source": f"*{stored}", "target": f"*{real}", "places": "*i64", "numbers": f"*{real}"}
     signature = {p.name: types.get(p.name, "i32") for p in program.params} | {"BLOCK": "constexpr"}
     made = compile(
@@ -272,8 +274,8 @@ def test_compiles_for_a_gpu_that_need_not_be_there(
     )
     text = made.asm["ptx"].splitlines()
     loads, stores = (sum(word in line for line in text) for word in ("ld.global", "st.global"))
-    assert loads in [2 * (STEPS + n) + STEPS + 2 * STEPS + 2 + 1 + 4 for n in places]
-    assert stores == 2 * STEPS
+    assert loads in [2 * (steps + n) + steps + 2 * steps + 2 + 1 + 4 for n in places]
+    assert stores == 2 * steps
 
 
 def test_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from filterlab.ops.cuda import recursion
 from filterlab.ops.cuda.launch import interpreting, launchable
-from filterlab.ops.cuda.recursion import BLOCK, STEPS
+from filterlab.ops.cuda.recursion import BLOCK, steps_of
 from filterlab.ops.prefilter import Filtering
 from filterlab.prefilters import Prefilter
 
@@ -49,20 +49,21 @@ def _launch(source: Tensor, target: Tensor, how: Filtering) -> None:
     """From (outer, length, inner) to as many coefficients along the axis in the middle."""
     outer, n, inner = source.shape
     lines, count, decay = outer * inner, target.shape[1], how.prefilter.decay(target.dtype)
-    before = _stepped(decay + count) - count  # so that the last coefficient ends a step
-    behind = _stepped(decay)
+    poles = len(how.prefilter.poles)
+    before = _stepped(decay + count, poles) - count  # so that the last coefficient ends a step
+    behind = _stepped(decay, poles)
     places = how.places(n, before, behind, target.device)
     numbers = _numbers(how.prefilter, behind, target.dtype, target.device)
     arrays = source, target, places, numbers
     sizes = lines, inner, count, before, behind, *source.stride()
-    program = _program("rows" if inner == 1 else "columns", len(how.prefilter.poles), interpreting())
+    program = _program("rows" if inner == 1 else "columns", poles, interpreting())
     with torch.cuda.device_of(target):  # Triton launches on the current device
         program[(-(-lines // BLOCK),)](*arrays, *sizes, BLOCK=BLOCK, num_warps=BLOCK // 32)
 
 
-def _stepped(places: int) -> int:
+def _stepped(places: int, poles: int) -> int:
     """Up to a whole number of steps."""
-    return -(-places // STEPS) * STEPS
+    return -(-places // steps_of(poles)) * steps_of(poles)
 
 
 @lru_cache(maxsize=64)

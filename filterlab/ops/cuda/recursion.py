@@ -15,7 +15,7 @@ last coefficient, and b is linear in the state a in which the line was left and 
 
     b = T a + Σ_k w_k f_{N+k},        T and w found once, in double precision (`ops.cuda.prefilter`).
 
-STEPS places are read before the first of them is used, as a thread waits for nothing so long as for memory. There are
+`steps_of` places are read before the first of them is used, as a thread waits for nothing so long as for memory. There are
 two ways to read and write them, and one recursion:
 
     lines that are neighbours in memory (along y and z)       a place is neighbouring numbers, one for each thread
@@ -29,15 +29,12 @@ from collections.abc import Sequence
 from filterlab.ops.cuda.source import Source
 
 BLOCK = 32  # lines of a program; a warp
-STEPS = 32
-"""Places that are under way at a time; a power of two. Of 256³ float32 on an H100 16 take 1.2 times as long along y and
-z, 1.5 times along x."""
 SIZES = (
     "lines",
     "inner",  # lines that are neighbours in memory; the next ones lie a whole block of them further
     "count",  # coefficients of a line
-    "before",  # places before the first coefficient; with `count` a multiple of STEPS
-    "behind",  # places behind the last; a multiple of STEPS
+    "before",  # places before the first coefficient; with `count` a multiple of `steps_of`
+    "behind",  # places behind the last; a multiple of `steps_of`
     "source_outer",  # strides of the samples (lines / inner, length, inner); the result is contiguous
     "source_step",
     "source_inner",
@@ -46,18 +43,27 @@ PARAMETERS = ("source", "target", "places", "numbers", *SIZES, "BLOCK: tl.conste
 """places: before + count + behind, int64. numbers, in the type of the result: poles, gain, T by rows, w_0, w_1, …"""
 
 
+def steps_of(poles: int) -> int:
+    """Places of a line that are under way at a time; a power of two.
+
+    Of 256³ float32 with one pole 16 of them take 1.2 times as long on an H100 along y and z, and 1.5 times along x. With
+    more poles twice as many take Triton three times as long to compile: 12 s of one core for four poles.
+    """
+    return 32 if poles == 1 else 16
+
+
 class Program:
     """Writes a program for so many poles."""
 
     name: str
 
     def __init__(self, poles: int) -> None:
-        self.poles = range(poles)
+        self.poles, self.steps = range(poles), steps_of(poles)
         self.source = Source(self.name, PARAMETERS)
         self.line = self.source.line
 
     def samples(self, first: str) -> None:
-        """f_0 …: the samples at STEPS places of the extended line."""
+        """f_0 …: the samples at `steps` places of the extended line."""
         raise NotImplementedError
 
     def load(self, first: str) -> None:
@@ -96,28 +102,28 @@ class Program:
         line(f"weights = numbers + {count + 1 + count**2}")
 
     def _forwards(self) -> None:
-        with self.source.block(f"for first in range(0, before + count, {STEPS})"):
+        with self.source.block(f"for first in range(0, before + count, {self.steps})"):
             self.samples("first")
-            for k in range(STEPS):
+            for k in range(self.steps):
                 self.line(f"f_{k} = {self._advance('a', f'f_{k}')}")
             self.store("first - before")
 
     def _turn(self) -> None:
         for j in self.poles:
             self.line(f"b_{j} = {' + '.join(f'turn_{j}_{i} * a_{i}' for i in self.poles)}")
-        with self.source.block(f"for first in range(0, behind, {STEPS})"):
+        with self.source.block(f"for first in range(0, behind, {self.steps})"):
             self.samples("before + count + first")
-            for k in range(STEPS):
+            for k in range(self.steps):
                 for j in self.poles:
                     weight = f"tl.load(weights + (first + {k}) * {len(self.poles)} + {j})"
                     self.line(f"b_{j} += {weight} * f_{k}")
 
     def _backwards(self) -> None:
         self.line("tl.debug_barrier()  # what one thread has stored, another may load")
-        with self.source.block(f"for done in range(0, count, {STEPS})"):
-            self.line(f"first = count - {STEPS} - done")
+        with self.source.block(f"for done in range(0, count, {self.steps})"):
+            self.line(f"first = count - {self.steps} - done")
             self.load("first")
-            for k in reversed(range(STEPS)):
+            for k in reversed(range(self.steps)):
                 self.line(f"f_{k} = {self._advance('b', f'f_{k}')} * gain")
             self.store("first")
 
@@ -135,18 +141,18 @@ class Columns(Program):
     name = "columns"
 
     def samples(self, first: str) -> None:
-        for k in range(STEPS):
+        for k in range(self.steps):
             self.line(f"place_{k} = tl.load(places + ({first} + {k}))")
-        for k in range(STEPS):
+        for k in range(self.steps):
             there = f"here + place_{k} * source_step, inside & (place_{k} >= 0), 0"
             self.line(f"f_{k} = tl.load({there}).to(arithmetic)")
 
     def load(self, first: str) -> None:
-        for k in range(STEPS):
+        for k in range(self.steps):
             self.line(f"f_{k} = tl.load({self._coefficient(first, k)}, {self._kept(first, k)}, 0.0)")
 
     def store(self, first: str) -> None:
-        for k in range(STEPS):
+        for k in range(self.steps):
             self.line(f"tl.store({self._coefficient(first, k)}, f_{k}, {self._kept(first, k)})")
 
     def _coefficient(self, first: str, k: int) -> str:
@@ -162,7 +168,7 @@ class Rows(Program):
     name = "rows"
 
     def samples(self, first: str) -> None:
-        self.line(f"place = tl.load(places + ({first} + tl.arange(0, {STEPS})))")
+        self.line(f"place = tl.load(places + ({first} + tl.arange(0, {self.steps})))")
         mask = "inside[:, None] & (place >= 0)[None, :]"
         self.line(f"tile = tl.load(here[:, None] + (place * source_step)[None, :], {mask}, 0).to(arithmetic)")
         self._deal("tile", self._all())
@@ -177,10 +183,10 @@ class Rows(Program):
         self.line(f"tl.store(tile_there, {self._collect(self._all())}, tile_kept)")
 
     def _all(self) -> list[str]:
-        return [f"f_{k}" for k in range(STEPS)]
+        return [f"f_{k}" for k in range(self.steps)]
 
     def _locate(self, first: str) -> None:
-        self.line(f"column = {first} + tl.arange(0, {STEPS})")
+        self.line(f"column = {first} + tl.arange(0, {self.steps})")
         self.line("tile_there = there[:, None] + column[None, :]")
         self.line("tile_kept = inside[:, None] & (column >= 0)[None, :]")
 
