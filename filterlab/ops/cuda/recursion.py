@@ -15,8 +15,8 @@ last coefficient, and b is linear in the state a in which the line was left and 
 
     b = T a + Σ_k w_k f_{N+k},        T and w found once, in double precision (`ops.cuda.prefilter`).
 
-`steps_of` places are read before the first of them is used, as a thread waits for nothing so long as for memory. There are
-two ways to read and write them, and one recursion:
+`steps_of` places are read before the first of them is used, as a thread waits for nothing so long as for memory. There
+are two ways to read and write them, and one recursion:
 
     lines that are neighbours in memory (along y and z)       a place is neighbouring numbers, one for each thread
     lines along x                                             a tile of lines × places, dealt out to the threads
@@ -46,8 +46,8 @@ PARAMETERS = ("source", "target", "places", "numbers", *SIZES, "BLOCK: tl.conste
 def steps_of(poles: int) -> int:
     """Places of a line that are under way at a time; a power of two.
 
-    Of 256³ float32 with one pole 16 of them take 1.2 times as long on an H100 along y and z, and 1.5 times along x. With
-    more poles twice as many take Triton three times as long to compile: 12 s of one core for four poles.
+    Of 256³ float32 with one pole 16 of them take 1.2 times as long on an H100 along y and z, and 1.5 times along x.
+    With more poles twice as many take Triton three times as long to compile: 12 s of one core for four poles.
     """
     return 32 if poles == 1 else 16
 
