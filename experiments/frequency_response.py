@@ -44,7 +44,7 @@ class Config(ExperimentConfig):
     def _measured(self) -> Config:
         measured = {recipe.key for recipe in self.methods}
         for recipe in self.methods:
-            needless = recipe.gradient is not None and recipe.scheme != "eight_trilinear"
+            needless = recipe.gradient is not None and recipe.scheme != "sampled"
             if recipe.sampler != "exact" or needless:
                 raise ValueError(f"{recipe.key}: a response belongs to the value; leave gradient and sampler out")
         for figure in self.figures:

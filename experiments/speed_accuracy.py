@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import torch
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from torch import Tensor
 
 import filterlab as fl
@@ -36,6 +36,7 @@ from experiments.timing import CLOCKS, TimedConfig, along_rays, cost_record, qua
 from experiments.views import Silent, View
 from filterlab.costs import Quartiles, measure, take_turns
 from filterlab.io.config import StrictModel
+from filterlab.methods import scheme_named
 from filterlab.scenes.model import SignalModel
 
 WORK: dict[str, tuple[str, int]] = {  # name -> where the points lie, order of the jet
@@ -52,7 +53,7 @@ class Variant(StrictModel):
 
     name: Annotated[str, Field(min_length=1)]
     dtype: Dtype = "float32"
-    scheme: Literal["direct", "fused", "eight_trilinear"] | None = None
+    scheme: Annotated[Literal["direct", "fused", "sampled"] | None, BeforeValidator(scheme_named)] = None
     sampler: Literal["exact", "texture_unit"] = "exact"
     storage: Literal["float64", "float32", "float16", "bfloat16", "int16", "int8", "uint8"] | None = None
 

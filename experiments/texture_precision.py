@@ -41,10 +41,10 @@ from filterlab.io.config import StrictModel
 from filterlab.scenes.model import SignalModel
 
 VARIANTS: dict[str, tuple[torch.dtype, str, str]] = {
-    "float64 eight samples": (torch.float64, "eight_trilinear", "exact"),
+    "float64 eight samples": (torch.float64, "sampled", "exact"),
     "float32 direct": (torch.float32, "direct", "exact"),
-    "float32 eight samples": (torch.float32, "eight_trilinear", "exact"),
-    "float32 8-bit fractions": (torch.float32, "eight_trilinear", "texture_unit"),
+    "float32 eight samples": (torch.float32, "sampled", "exact"),
+    "float32 8-bit fractions": (torch.float32, "sampled", "texture_unit"),
 }
 
 
@@ -108,10 +108,10 @@ class Config(ExperimentConfig):
         for recipe in [*self.methods, *self.image_methods]:
             if (recipe.scheme, recipe.sampler) != (None, "exact"):
                 raise ValueError(f"{recipe.key}: every scheme and sampler is measured; leave them out")
-            if "eight_trilinear" not in fl.METHODS[recipe.name].facts.schemes:
-                offering = [m for m, method in fl.METHODS.items() if "eight_trilinear" in method.facts.schemes]
-                raise ValueError(f"{recipe.name} offers no scheme eight_trilinear; {', '.join(offering)} do")
-            _variant(recipe, "eight_trilinear", "exact")
+            if "sampled" not in fl.METHODS[recipe.name].facts.schemes:
+                offering = [m for m, method in fl.METHODS.items() if "sampled" in method.facts.schemes]
+                raise ValueError(f"{recipe.name} offers no scheme sampled; {', '.join(offering)} do")
+            _variant(recipe, "sampled", "exact")
         return self
 
 
@@ -130,7 +130,7 @@ def units(config: Config) -> list[Unit]:
         seconds = 0.5 + config.points * 1e-4
         work += [Unit(f"{i}/points/{r.key}", f"{source.title}, {r.key}", seconds) for r in config.methods]
         if source.view is not None:
-            seconds = 2 * source.view.seconds(source.extent(), "eight_trilinear")
+            seconds = 2 * source.view.seconds(source.extent(), "sampled")
             work += [
                 Unit(f"{i}/image/{r.key}", f"{source.title}, {r.key}: images", seconds) for r in config.image_methods
             ]
@@ -143,7 +143,7 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
     source = config.sources[int(index)]
     recipe = next(r for r in (config.methods if what == "points" else config.image_methods) if r.key == key)
     volume = run.memo(f"volume:{index}", lambda: source.load(config.device))
-    common = {"source": int(index), "kind": what, **_variant(recipe, "eight_trilinear", "exact").record()}
+    common = {"source": int(index), "kind": what, **_variant(recipe, "sampled", "exact").record()}
     if what == "points":
         return {**common, **_precision(config, source, volume, recipe)}
     return {**common, **_images(config, source, volume, recipe, run)}
@@ -195,8 +195,7 @@ def _images(config: Config, source: Source, volume: fl.Volume, recipe: Recipe, r
     assert source.view is not None
     single = volume.to(torch.float32)
     fields = [
-        _variant(recipe, "eight_trilinear", sampler).build(single, config.boundary)
-        for sampler in ("exact", "texture_unit")
+        _variant(recipe, "sampled", sampler).build(single, config.boundary) for sampler in ("exact", "texture_unit")
     ]
     exact, rounded = (source.view.draw(field, run, config.device, "float32") for field in fields)
     stem = f"{config.sources.index(source)}-{recipe.key}"

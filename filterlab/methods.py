@@ -196,24 +196,24 @@ class TensorProduct(Method):
     @property
     def schemes(self) -> tuple[str, ...]:
         """The ways of evaluating it; the first one that can run is the default."""
-        return ("fused", "direct") if self.sampled is None else ("fused", "direct", "eight_trilinear")
+        return ("fused", "direct") if self.sampled is None else ("fused", "direct", "sampled")
 
     def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> Scheme:
         self._check_offered(name, gradient)
-        if name == "eight_trilinear":
+        if name == "sampled":
             if (gradient or self.gradients[0]) != self.sampled_gradient:
                 raise ValueError(
-                    f"eight_trilinear gives {self.name} the {self.sampled_gradient} gradient: ask for "
+                    f"sampled gives {self.name} the {self.sampled_gradient} gradient: ask for "
                     f"gradient={self.sampled_gradient!r}, or for scheme='direct'; got gradient={gradient!r}"
                 )
             assert self.sampled is not None
             return self.sampled(named_sampler(sampler))
         if sampler != "exact":
-            raise ValueError(f"sampler={sampler!r} needs scheme='eight_trilinear'; a sum over taps takes no samples")
+            raise ValueError(f"sampler={sampler!r} needs scheme='sampled'; a sum over taps takes no samples")
         return Direct(self.value_terms, name or self.schemes[0], gradient or self.gradients[0])
 
     def gradient_of(self, scheme: str) -> str:
-        return self.sampled_gradient if scheme == "eight_trilinear" else self.gradients[0]
+        return self.sampled_gradient if scheme == "sampled" else self.gradients[0]
 
     def reach(self, prefilter: bool) -> int:
         return self.kernel.support + (self.prefilter.decay(torch.float64) if prefilter else 0)
@@ -234,6 +234,14 @@ class TensorProduct(Method):
                 raise ValueError(f"scheme='fused' can't run here: {why}; scheme='direct' can")
             scheme = replace(scheme, name="direct")
         return GridField(self.name, volume, coefficients, scheme)
+
+
+_FORMER_SCHEMES = {"eight_trilinear": "sampled"}
+
+
+def scheme_named(name: str | None) -> str | None:
+    """A scheme by its present name: some files know it by a former one."""
+    return _FORMER_SCHEMES.get(name, name) if isinstance(name, str) else name
 
 
 def tensor_product(method: str | Method | PiecewisePolynomial) -> TensorProduct | None:
@@ -351,11 +359,11 @@ def reconstruct(
         boundary: how the samples go on beyond the ends: mirror, reflect, wrap, border or zeros.
         prefilter: False to sum the samples themselves (blurs with a kernel that does not interpolate).
         scheme: `fused` (the sum over taps in vector code compiled for this processor), `direct` (the same sum in plain
-            torch, on any device) or, where the method offers it, `eight_trilinear` (for trilinear, whose gradient it
+            torch, on any device) or, where the method offers it, `sampled` (for trilinear, whose gradient it
             takes by central differences, together with gradient="central"). Default: `fused` where it can run, else
             `direct`; `field.scheme.name` says which.
         gradient: `analytic` or `central`, where the method offers both; default: the method's own.
-        sampler: for `eight_trilinear`: `exact`, `texture_unit` (8-bit fractions) or a callable.
+        sampler: for `sampled`: `exact`, `texture_unit` (8-bit fractions) or a callable.
         storage: how coefficients are stored: float64, float32, float16, bfloat16, int16, int8 or uint8 (a torch.dtype
             or its name; integers with a scale and an offset, see `filterlab.fields.storage`). Default: prefiltered
             ones as promote(samples, float32), others as the samples are. Arithmetic does not depend on it.
@@ -376,6 +384,7 @@ def reconstruct(
     if not isinstance(prefilter, bool):
         raise TypeError(f"prefilter must be True or False; got {prefilter!r} (from_kernel pairs a kernel with another)")
     volume, method, boundary = as_volume(volume), as_method(method), Boundary.named(boundary)
+    scheme = scheme_named(scheme)
     method.scheme(scheme, gradient, sampler)  # refused before the samples are read
     samples, unknown = missing_values.resolved(volume.samples, nan)
     return method.build(volume, Asked(samples, unknown, boundary, prefilter, scheme, gradient, sampler, storage))

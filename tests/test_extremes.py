@@ -65,8 +65,8 @@ def test_cases_draw_their_own_numbers() -> None:
 def test_a_sweep_leaves_out_what_a_method_does_not_offer() -> None:
     case = Case("x", "", "", lambda *_: Finding(1, 0, 0), ("method", "scheme"))
     found = case.subjects(["mitchell", "notch"])
-    assert Subject("mitchell", "eight_trilinear") not in found
-    assert Subject("notch", "eight_trilinear") in found
+    assert Subject("mitchell", "sampled") not in found
+    assert Subject("notch", "sampled") in found
     assert Case("y", "", "", lambda *_: Finding(1, 0, 0)).subjects() == [Subject()]
 
 

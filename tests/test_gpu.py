@@ -47,7 +47,7 @@ def test_values_gradients_and_derivatives(method: str, scheme: str, boundary: st
     for dtype in TOLERANCE:
         results = []
         for device in ("cpu", "cuda"):
-            gradient = "central" if (method, scheme) == ("trilinear", "eight_trilinear") else None
+            gradient = "central" if (method, scheme) == ("trilinear", "sampled") else None
             x = samples(dtype).to(device).requires_grad_()
             p = points(dtype).to(device).requires_grad_()
             field = reconstruct(x, method, boundary=boundary, scheme=scheme, gradient=gradient)

@@ -44,7 +44,7 @@ def ways() -> list[tuple[str, str, str, bool]]:
     out = []
     for name, method in METHODS.items():
         for scheme, gradient in product(method.facts.schemes, method.facts.gradients):
-            if scheme == "eight_trilinear" and gradient != method.sampled_gradient:
+            if scheme == "sampled" and gradient != method.sampled_gradient:
                 continue
             out += [(name, scheme, gradient, p) for p in ((True, False) if method.facts.prefiltered else (True,))]
     return out
@@ -196,7 +196,7 @@ def test_declared_facts_are_the_published_ones(method):
     assert f.prefiltered == (method in ("triquadratic", "notch", "tricubic"))
     assert f.gradients[0] == ("central" if method == "ncrsi" else "analytic")
     assert set(f.gradients) == ({"analytic", "central"} if method in ("trilinear", "ncrsi") else {"analytic"})
-    assert ("eight_trilinear" in f.schemes) == (method not in ("catmull-rom", "mitchell"))
+    assert ("sampled" in f.schemes) == (method not in ("catmull-rom", "mitchell"))
 
 
 def polynomial(degree: int, p: np.ndarray) -> np.ndarray:
@@ -456,13 +456,13 @@ def test_many_points_are_chunked_and_give_the_same(method):
     [
         ({"method": "lanczos"}, "trilinear, catmull-rom, ncrsi"),
         ({"boundary": "clamp"}, "mirror, reflect, wrap, border, zeros"),
-        ({"scheme": "fuzed"}, "fused, direct, eight_trilinear"),
-        ({"method": "catmull-rom", "scheme": "eight_trilinear"}, "direct"),
+        ({"scheme": "fuzed"}, "fused, direct, sampled"),
+        ({"method": "catmull-rom", "scheme": "sampled"}, "direct"),
         ({"gradient": "central"}, "analytic"),
         ({"gradient": "sobel"}, "analytic"),
-        ({"sampler": "texture_unit"}, "eight_trilinear"),
-        ({"sampler": "nearest", "scheme": "eight_trilinear"}, "exact, texture_unit"),
-        ({"method": "ncrsi", "scheme": "eight_trilinear", "gradient": "analytic"}, "central"),
+        ({"sampler": "texture_unit"}, "sampled"),
+        ({"sampler": "nearest", "scheme": "sampled"}, "exact, texture_unit"),
+        ({"method": "ncrsi", "scheme": "sampled", "gradient": "analytic"}, "central"),
     ],
 )
 def test_unknown_names_and_combinations_list_the_known_ones(options, match):

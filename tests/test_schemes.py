@@ -13,10 +13,11 @@ from filterlab.fields.tensor_product import SAMPLERS, exact_sample
 from filterlab.kernels import bc
 from filterlab.methods import METHODS, reconstruct
 from filterlab.ops.differentiable.gather import IMPLEMENTATIONS
+from filterlab.scenes.model import Reconstruction
 from filterlab.volume import Boundary
 from tests import laws, oracles
 
-SAMPLED = [name for name, method in METHODS.items() if "eight_trilinear" in method.facts.schemes]
+SAMPLED = [name for name, method in METHODS.items() if "sampled" in method.facts.schemes]
 SHAPE = (5, 7, 6)
 every_sampled = pytest.mark.parametrize("method", SAMPLED)
 every_boundary = pytest.mark.parametrize("boundary", Boundary)
@@ -24,7 +25,7 @@ every_boundary = pytest.mark.parametrize("boundary", Boundary)
 
 def sampled(samples: torch.Tensor, method: str, **options) -> Field:
     """The method by trilinear samples, with the kind of gradient they give it."""
-    return reconstruct(samples, method, scheme="eight_trilinear", gradient=METHODS[method].sampled_gradient, **options)
+    return reconstruct(samples, method, scheme="sampled", gradient=METHODS[method].sampled_gradient, **options)
 
 
 def volume() -> torch.Tensor:
@@ -46,14 +47,14 @@ def pair(method: str, boundary: str = "mirror", prefilter: bool = True):
     gradient = METHODS[method].sampled_gradient
     return [
         reconstruct(volume(), method, boundary=boundary, prefilter=prefilter, gradient=gradient, scheme=scheme)
-        for scheme in ("direct", "eight_trilinear")
+        for scheme in ("direct", "sampled")
     ]
 
 
 @every_sampled
 @every_boundary
 @pytest.mark.parametrize("prefilter", [True, False])
-def test_eight_trilinear_agrees_with_direct_to_rounding_ties_included(method, boundary, prefilter):
+def test_sampled_agrees_with_direct_to_rounding_ties_included(method, boundary, prefilter):
     direct, sampled = pair(method, str(boundary), prefilter)
     for at in (points(), ties()):
         for a, b in zip(sampled.value_and_gradient(at), direct.value_and_gradient(at), strict=True):
@@ -106,7 +107,7 @@ def test_what_a_texture_unit_costs_is_bounded_and_not_nothing(method):
 
 def test_texture_unit_is_exact_at_multiples_of_1_256():
     exact, rounded = (
-        reconstruct(volume(), "trilinear", scheme="eight_trilinear", gradient="central", sampler=sampler)
+        reconstruct(volume(), "trilinear", scheme="sampled", gradient="central", sampler=sampler)
         for sampler in ("exact", "texture_unit")
     )
     at = torch.randint(0, 256 * 4, (50, 3)).double() / 256
@@ -119,7 +120,7 @@ def test_the_rounding_is_invisible_to_derivatives():
     """Straight-through: autograd through the texture unit gives the slope of the sample it took, not zero."""
     at = points(beyond=0).requires_grad_()
     fields = [
-        reconstruct(volume(), "triquadratic", scheme="eight_trilinear", sampler=sampler)
+        reconstruct(volume(), "triquadratic", scheme="sampled", sampler=sampler)
         for sampler in ("exact", "texture_unit")
     ]
     slopes = [torch.autograd.grad(field(at).sum(), at)[0] for field in fields]
@@ -132,7 +133,7 @@ def test_a_callable_is_a_sampler():
         return exact_sample(coefficients, at.round())
 
     f = volume()
-    field = reconstruct(f, "trilinear", scheme="eight_trilinear", gradient="central", sampler=nearest)
+    field = reconstruct(f, "trilinear", scheme="sampled", gradient="central", sampler=nearest)
     laws.assert_close(field(torch.tensor([[1.2, 3.4, 2.6]], dtype=torch.float64)), f[3, 3, 1][None], 1e-15)
     assert set(SAMPLERS) >= {"exact", "texture_unit"}
 
@@ -141,7 +142,7 @@ def test_a_callable_is_a_sampler():
 def test_a_field_tells_how_it_is_evaluated(method):
     direct, sampled = pair(method)
     assert direct.scheme.name == "direct"
-    assert sampled.scheme.name == "eight_trilinear"
+    assert sampled.scheme.name == "sampled"
     assert sampled.scheme.gradient == METHODS[method].sampled_gradient
     assert sampled.max_order == 1
     assert reconstruct(volume(), method).scheme.name == "fused"
@@ -153,7 +154,7 @@ def test_float32_keeps_its_digits_on_a_long_axis(method):
     samples, points = torch.rand(3, 3, 512), torch.rand(2000, 3) * torch.tensor([511.0, 2.0, 2.0])
     gradient = "central" if method == "trilinear" else None
     expected = reconstruct(samples.double(), method, gradient=gradient).jet(points.double(), 1)
-    for scheme in ("direct", "eight_trilinear"):
+    for scheme in ("direct", "sampled"):
         for got, want in zip(
             reconstruct(samples, method, gradient=gradient, scheme=scheme).jet(points, 1), expected, strict=True
         ):
@@ -162,12 +163,12 @@ def test_float32_keeps_its_digits_on_a_long_axis(method):
 
 def test_a_scheme_does_not_change_the_kind_of_gradient_silently():
     with pytest.raises(ValueError, match="ask for gradient='central'"):
-        reconstruct(volume(), "trilinear", scheme="eight_trilinear")
+        reconstruct(volume(), "trilinear", scheme="sampled")
 
 
 def test_a_field_says_what_it_is():
-    field = reconstruct(volume(), "notch", scheme="eight_trilinear", boundary="wrap")
-    for word in ("notch", "eight_trilinear", "analytic", "wrap", "float64"):
+    field = reconstruct(volume(), "notch", scheme="sampled", boundary="wrap")
+    for word in ("notch", "sampled", "analytic", "wrap", "float64"):
         assert word in repr(field)
 
 
@@ -210,3 +211,10 @@ def test_coefficients_that_are_changed_in_place_are_seen(turned):
     before = other(at)
     values.mul_(2)
     assert torch.equal(other(at), 2 * before)
+
+
+def test_a_former_name_of_the_sampled_scheme_is_understood() -> None:
+    """Also in files: scenes and experiments that were written before it was called so."""
+    volume = torch.rand(4, 5, 6)
+    assert reconstruct(volume, "triquadratic", scheme="eight_trilinear").scheme.name == "sampled"
+    assert Reconstruction.model_validate({"name": "notch", "scheme": "eight_trilinear"}).scheme == "sampled"

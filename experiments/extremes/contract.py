@@ -93,7 +93,7 @@ class Case:
         """All subjects of its sweep; schemes that a method does not offer are left out."""
         ranges = {
             "method": list(fl.METHODS if methods is None else methods),
-            "scheme": ["fused", "direct", "eight_trilinear"] if schemes is None else list(schemes),
+            "scheme": ["fused", "direct", "sampled"] if schemes is None else list(schemes),
             "boundary": list(map(str, fl.Boundary)) if boundaries is None else list(boundaries),
             "device": list(devices),
         }

@@ -188,8 +188,8 @@ def _image_front(axes: Axes, entries: Iterable[Record], members: Sequence[str]) 
 def schemes_plot(config: Config, records: Mapping[str, Record], n: int) -> Plot:
     """Time per value and gradient of every method by its schemes."""
     costs = records[f"cost/{n}/gradient-rays"]["costs"]
-    markers = {"default": "o", "fused": "o", "direct": "s", "eight_trilinear": "D"}
-    words = {"default": "fused", "direct": "sum over taps in plain torch", "eight_trilinear": "trilinear samples"}
+    markers = {"default": "o", "fused": "o", "direct": "s", "sampled": "D"}
+    words = {"default": "fused", "direct": "sum over taps in plain torch", "sampled": "trilinear samples"}
     methods = [r.record() for r in config.methods]
     with plots.settings():
         figure = plots.canvas(10.4, 0.42 * len(methods) + 1.3)

@@ -36,7 +36,7 @@ class Scheme(Protocol):
     """How the sum over coefficients is computed.
 
     Attributes:
-        name: `direct`, `eight_trilinear`, …
+        name: `direct`, `sampled`, …
         gradient: `analytic`, or `central` (differences of the trilinear interpolant).
         max_order: the highest derivative it gives.
         reach: coefficients needed on each side of a point's cell.

@@ -42,7 +42,7 @@ class SevenSamples(Sampled):
 
     sample: Sampler
     terms: tuple[Term, ...] = NCRSI_TERMS
-    name: str = "eight_trilinear"
+    name: str = "sampled"
     gradient: str = "central"
     max_order: int = 1
     reach: int = 3

@@ -1,6 +1,6 @@
 """Schemes for separable kernels: the sum over taps, and linear combinations of trilinear samples.
 
-`direct` sums S³ taps in plain torch, `fused` the same in compiled vector code. `eight_trilinear` is what a texture unit
+`direct` sums S³ taps in plain torch, `fused` the same in compiled vector code. `sampled` is what a texture unit
 wants: eight trilinear samples for a triquadratic value *and* its gradient (the paper's contribution), 8 + 24 for a
 tricubic one (Sigg & Hadwiger). The trilinear sample itself is pluggable; one sampler models the 8-bit fractions of a
 texture unit.
@@ -174,7 +174,7 @@ class EightTrilinearQuadratic(Sampled):
 
     sample: Sampler
     terms: tuple[Term, ...] = field(default_factory=lambda: same_kernel(bspline(2)))
-    name: str = "eight_trilinear"
+    name: str = "sampled"
     gradient: str = "analytic"
     max_order: int = 1
     reach: int = 2
@@ -202,7 +202,7 @@ class EightTrilinearCubic(Sampled):
 
     sample: Sampler
     terms: tuple[Term, ...] = field(default_factory=lambda: same_kernel(bspline(3)))
-    name: str = "eight_trilinear"
+    name: str = "sampled"
     gradient: str = "analytic"
     max_order: int = 1
     reach: int = 3
@@ -255,7 +255,7 @@ class TrilinearCentral(Sampled):
 
     sample: Sampler
     terms: tuple[Term, ...] = field(default_factory=lambda: same_kernel(LINEAR))
-    name: str = "eight_trilinear"
+    name: str = "sampled"
     gradient: str = "central"
     max_order: int = 1
     reach: int = 3

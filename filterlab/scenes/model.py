@@ -24,7 +24,7 @@ from filterlab.fields.storage import StorageName
 from filterlab.io.bounded import VolumeFileError
 from filterlab.io.config import StrictModel, unknown_name
 from filterlab.io.volumes import VolumeHeader, describe, load_volume
-from filterlab.methods import METHODS, Method, reconstruct
+from filterlab.methods import METHODS, Method, reconstruct, scheme_named
 from filterlab.missing_values import NanChoice
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
 from filterlab.render.rays import check_region
@@ -249,7 +249,7 @@ class Reconstruction(StrictModel):
     name: Annotated[str, AfterValidator(_known_method)]
     prefilter: bool = True
     gradient: Literal["analytic", "central"] | None = None
-    scheme: str | None = None
+    scheme: Annotated[str | None, AfterValidator(scheme_named)] = None
     sampler: Literal["exact", "texture_unit"] = "exact"
     storage: StorageName | None = None
 

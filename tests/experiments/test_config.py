@@ -49,8 +49,8 @@ def test_every_experiment_has_a_config():
         ({"methods": "[notch, notch]"}, "methods", ["notch is listed twice"]),
         ({"methods.0": "{name: ncrsi, prefilter: false}"}, "methods[0]", ["no prefilter"]),
         ({"methods.0": "{name: notch, gradient: central}"}, "methods[0]", ["analytic"]),
-        ({"methods.0": "{name: mitchell, scheme: eight_trilinear}"}, "methods[0]", ["direct"]),
-        ({"methods.0": "{name: notch, sampler: texture_unit}"}, "methods[0]", ["eight_trilinear"]),
+        ({"methods.0": "{name: mitchell, scheme: sampled}"}, "methods[0]", ["direct"]),
+        ({"methods.0": "{name: notch, sampler: texture_unit}"}, "methods[0]", ["sampled"]),
         ({"methods.0": "{method: notch}"}, "methods[0]", ["called name", "{name: notch"]),
         ({"device": "abacus"}, "device", ["cpu"]),
         ({"device": "meta"}, "device", ["cpu", "'meta'"]),
@@ -109,9 +109,9 @@ def test_a_recipe_knows_its_defaults():
 
 def test_the_sampled_scheme_says_which_gradient_it_gives():
     with pytest.raises(ValueError, match="central"):
-        Recipe(name="trilinear", scheme="eight_trilinear")
-    sampled = Recipe(name="trilinear", gradient="central", scheme="eight_trilinear")
-    assert (sampled.gradient_kind, Recipe(name="ncrsi", scheme="eight_trilinear").gradient_kind) == ("central",) * 2
+        Recipe(name="trilinear", scheme="sampled")
+    sampled = Recipe(name="trilinear", gradient="central", scheme="sampled")
+    assert (sampled.gradient_kind, Recipe(name="ncrsi", scheme="sampled").gradient_kind) == ("central",) * 2
     for name, key in (
         ("texture_precision", "methods"),
         ("texture_precision", "image_methods"),
@@ -120,7 +120,7 @@ def test_the_sampled_scheme_says_which_gradient_it_gives():
         with pytest.raises(ConfigError, match="gradient='central'"):
             load(name, {key: "[trilinear]"})
     with pytest.raises(ConfigError, match="leave them out"):
-        load("texture_precision", {"methods": "[{name: notch, scheme: eight_trilinear}]"})
+        load("texture_precision", {"methods": "[{name: notch, scheme: sampled}]"})
 
 
 def test_seed_and_device_hold_for_sections_without_their_own():

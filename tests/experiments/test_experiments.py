@@ -141,7 +141,7 @@ def tiny(name, scan):
         "variants": [
             {"name": "float32"},
             {"name": "float16", "storage": "float16"},
-            {"name": "eight samples", "scheme": "eight_trilinear"},
+            {"name": "eight samples", "scheme": "sampled"},
         ],
         "images": [
             {"title": "steps", "methods": ["triquadratic"], "resolutions": [8], "steps": [2, 1], "shown": [8, 1]},
@@ -495,7 +495,7 @@ def test_a_mistake_of_ours_keeps_its_traceback(tiny_rms, tmp_path, monkeypatch):
 
 
 def test_the_response_of_the_sampled_scheme_is_measured(ran):
-    sampled = {"name": "trilinear", "gradient": "central", "scheme": "eight_trilinear"}
+    sampled = {"name": "trilinear", "gradient": "central", "scheme": "sampled"}
     _, records, _ = ran("frequency_response", methods=["trilinear", sampled], figures=[])
     assert all(record["largest_difference"] < 1e-6 for record in records.values())
     assert len(records) == 2

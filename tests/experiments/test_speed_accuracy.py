@@ -64,8 +64,8 @@ def test_claims_compare_what_they_name():
         CENTRAL: cost(10, 20, 10),
         "triquadratic": cost(5, 10, 500),
         "triquadratic+direct": cost(50, 50, 50),
-        "triquadratic+eight_trilinear": cost(100, 100, 100),
-        f"{CENTRAL}+eight_trilinear": cost(80, 80, 80),
+        "triquadratic+sampled": cost(100, 100, 100),
+        f"{CENTRAL}+sampled": cost(80, 80, 80),
     }
     errors = {"triquadratic": 0.1, CENTRAL: 0.4, "ncrsi": 0.2, "notch": 0.3, "triquadratic+unprefiltered": 0.8}
     images = [("triquadratic", 1, 30.0), ("triquadratic", 0.5, 41.0), (CENTRAL, 1, 29.0), (CENTRAL, 0.5, 38.5)]
@@ -116,7 +116,7 @@ TINY = {
         {"name": "float32"},
         {"name": "float64", "dtype": "float64"},
         {"name": "uint8", "storage": "uint8"},
-        {"name": "eight samples", "scheme": "eight_trilinear"},
+        {"name": "eight samples", "scheme": "sampled"},
     ],
     "images": [
         {
@@ -142,10 +142,10 @@ def config(**changes):
 def test_candidates_are_methods_in_the_variants_they_offer():
     keys = [c.key for c in config().candidates]
     assert len(keys) == len(set(keys)) == 11
-    assert "triquadratic+eight_trilinear" in keys
+    assert "triquadratic+sampled" in keys
     assert "trilinear+central+in_float64" in keys
-    assert "trilinear+eight_trilinear" not in keys, "its analytic gradient has no such scheme"
-    assert Variant(name="x", scheme="eight_trilinear").of(Recipe(name="mitchell")) is None
+    assert "trilinear+sampled" not in keys, "its analytic gradient has no such scheme"
+    assert Variant(name="x", scheme="sampled").of(Recipe(name="mitchell")) is None
 
 
 @pytest.mark.parametrize(

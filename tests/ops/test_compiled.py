@@ -55,7 +55,7 @@ def test_text_is_exact() -> None:
         assert compiled.placement_of(compiled.placement_text(place)) == place
 
 
-@pytest.mark.parametrize("scheme", ["fused", "direct", "eight_trilinear"])
+@pytest.mark.parametrize("scheme", ["fused", "direct", "sampled"])
 def test_a_field_compiles_whole(scheme: str) -> None:
     torch._dynamo.reset()
     field = fl.reconstruct(fl.Volume(torch.rand(7, 8, 9), spacing=(1, 2, 0.5)), "triquadratic", scheme=scheme)

@@ -289,7 +289,7 @@ def test_what_cannot_be_fused_is_marched_plainly(monkeypatch: pytest.MonkeyPatch
     many = Shading([Light((1.0, float(k), 0.0)) for k in range(9)])
     fields = [
         (reconstruct(samples(), scheme="direct"), None),
-        (reconstruct(samples(), scheme="eight_trilinear"), None),
+        (reconstruct(samples(), scheme="sampled"), None),
         (signals.gaussian(), None),
         (reconstruct(samples(), scheme="fused"), many),
     ]
