@@ -30,7 +30,7 @@ ACCUMULATORS = 12
 PACKS = 8  # of a step of read and copy
 
 
-class Job(ctypes.Structure):
+class FloorJob(ctypes.Structure):
     """What a program is told: where its buffer is, how many steps to take over it, how often."""
 
     _fields_ = [("buffer", ctypes.c_void_p), ("steps", ctypes.c_int64), ("times", ctypes.c_int64)]
@@ -119,7 +119,7 @@ def copies(size: int, times: int = 1) -> Callable[[], Tensor]:
 def _call(program: Program, buffer: Tensor, steps: int, times: int) -> Callable[[], Tensor]:
     function = compiled(program)
 
-    job = Job(buffer.data_ptr(), steps, times)
+    job = FloorJob(buffer.data_ptr(), steps, times)
 
     def call() -> Tensor:
         function(ctypes.addressof(job), 0, 1)

@@ -32,12 +32,11 @@ from filterlab.fields.base import Domain
 from filterlab.io.config import StrictModel
 from filterlab.render.camera import Camera
 from filterlab.render.dvr import render
+from filterlab.render.image import RayTensors
 from filterlab.render.transfer import TransferFunction
 from filterlab.scenes import model as scene
 from filterlab.signals import Signal
 from filterlab.volume import Geometry
-
-Rays = tuple[Tensor, Tensor]
 
 _POINTS = 20_000  # at which fields are compared with the signal
 _INNER = 0.9  # the share of the box, along each axis, that these points lie in
@@ -126,8 +125,8 @@ class Bench:
     recipe: Recipe
     boundary: str
     images_of: str
-    training: Rays
-    held_out: Rays
+    training: RayTensors
+    held_out: RayTensors
     shown: dict[str, Camera]
     order: Tensor
     points: Tensor
@@ -178,7 +177,7 @@ class Bench:
         """What the target images are of."""
         return self.signal if self.images_of == "signal" else self.field(self.samples.samples)
 
-    def render(self, field: fl.Field, transfer: TransferFunction, rays: Rays | Camera, size: int = 0) -> Tensor:
+    def render(self, field: fl.Field, transfer: TransferFunction, rays: RayTensors | Camera, size: int = 0) -> Tensor:
         """Linear RGB of rays `(R, 3)`, or of a camera's image of `size`² pixels; the same step in the world for all."""
         views, dtype = self.views, self.samples.dtype
         return render(
@@ -195,7 +194,7 @@ class Bench:
         )[..., :3]
 
     @torch.no_grad()
-    def image(self, field: fl.Field, transfer: TransferFunction, rays: Rays | Camera, size: int = 0) -> Tensor:
+    def image(self, field: fl.Field, transfer: TransferFunction, rays: RayTensors | Camera, size: int = 0) -> Tensor:
         """The same without derivatives."""
         return self.render(field, transfer, rays, size)
 
@@ -216,12 +215,12 @@ def _geometry(domain: Domain, n: int) -> Geometry:
     return Geometry.of(spacing, [a + s / 2 for a, s in zip(domain.lower, spacing, strict=True)])
 
 
-def _rays(cameras: list[Camera], size: int, device: str) -> Rays:
+def _rays(cameras: list[Camera], size: int, device: str) -> RayTensors:
     origins, directions = zip(*(camera.rays(size, size) for camera in cameras), strict=True)
     return tuple(torch.cat(x).reshape(-1, 3).to(device) for x in (origins, directions))  # type: ignore[return-value]
 
 
-def picked(rays: Rays, index: Tensor) -> Rays:
+def picked(rays: RayTensors, index: Tensor) -> RayTensors:
     """Some of the rays."""
     return rays[0][index], rays[1][index]
 

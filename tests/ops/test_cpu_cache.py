@@ -46,7 +46,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def compilations(monkeypatch: pytest.MonkeyPatch) -> list:
     done: list = []
     compile = compiler._compile
-    monkeypatch.setattr(compiler, "_compile", lambda recipe: (done.append(recipe), compile(recipe))[1])
+    monkeypatch.setattr(compiler, "_compile", lambda variant: (done.append(variant), compile(variant))[1])
     return done
 
 
@@ -370,7 +370,7 @@ from filterlab.render import PerspectiveCamera, TransferFunction, render
 torch.manual_seed(0)
 made = []
 compile = compiler._compile
-compiler._compile = lambda recipe: (made.append(recipe), compile(recipe))[1]
+compiler._compile = lambda variant: (made.append(variant), compile(variant))[1]
 samples = torch.rand(6, 6, 6, dtype=torch.float64).requires_grad_()
 opacities = torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64).requires_grad_()
 transfer = TransferFunction([0.0, 0.5, 1.0], torch.rand(3, 3), opacities)

@@ -172,7 +172,7 @@ def test_what_is_not_asked_is_not_computed(device: str) -> None:
         found = on_device(marched, device, given, [name])
         assert_same(found, {key: everything[key] for key in found}, 1e-14)
         assert found
-        text = str(cuda._recipe_of_adjoint(marched, (name,)).write())
+        text = str(cuda._variant_of_adjoint(marched, (name,)).write())
         assert not [word for word in words if word in text], name
     assert on_device(marched, device, given, []) == {}
 
@@ -289,12 +289,12 @@ def test_compiles_for_a_gpu_that_need_not_be_there(
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
     derivatives, raised = stencil.derivatives
     slopes = (derivatives.lowered, raised)
-    recipe = adjoint.Recipe(GRADIENTS, stencil.lowered, slopes, lights, skipping=True, even=False)
-    types = dict.fromkeys(segments.arrays_of(recipe), "*fp64")
+    variant = adjoint.AdjointVariant(GRADIENTS, stencil.lowered, slopes, lights, skipping=True, even=False)
+    types = dict.fromkeys(segments.arrays_of(variant), "*fp64")
     numbers = ("inner", "opacities", "colors", "shading", "view", "world", "coefficient_gradient")
     types |= dict.fromkeys(numbers, f"*{number}")
     types |= {"coefficients": f"*{stored}", "count": "*i64", "bricks": "*u8", "BLOCK": "constexpr"}
-    written = launch.launchable(recipe.write())
+    written = launch.launchable(variant.write())
     signature = {p.name: types.get(p.name, "i32") for p in written.params}
     source = ASTSource(written, signature, {"BLOCK": segments.BLOCK})
     made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})

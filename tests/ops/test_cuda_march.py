@@ -219,15 +219,17 @@ def test_compiles_for_a_gpu_that_need_not_be_there(monkeypatch: pytest.MonkeyPat
     types = dict.fromkeys(("coefficients", "inner", "opacities", "colors", "shading", "view", "world"), "*fp32")
     types |= dict.fromkeys(("entry", "direction", "length", "offset", "numbers", "light", "optical_depth"), "*fp64")
     types |= {"count": "*i64", "bricks": "*u8", "BLOCK": "constexpr"}
-    written = launch.launchable(compositing.Recipe(Stencil.jet(LINEAR, 1).lowered, 1, skipping=True, even=True).write())
+    written = launch.launchable(
+        compositing.MarchVariant(Stencil.jet(LINEAR, 1).lowered, 1, skipping=True, even=True).write()
+    )
     source = ASTSource(written, {p.name: types.get(p.name, "i32") for p in written.params}, {"BLOCK": segments.BLOCK})
     made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})
     assert "bar.sync" not in made.asm["ptx"]  # one warp waits for nobody
 
 
 def test_what_a_scene_does_not_ask_for_is_not_computed() -> None:
-    unlit = str(compositing.Recipe(Stencil.jet(LINEAR, 0).lowered, None, skipping=False, even=False).write())
-    lit = str(compositing.Recipe(Stencil.jet(LINEAR, 1).lowered, 2, skipping=True, even=False).write())
+    unlit = str(compositing.MarchVariant(Stencil.jet(LINEAR, 0).lowered, None, skipping=False, even=False).write())
+    lit = str(compositing.MarchVariant(Stencil.jet(LINEAR, 1).lowered, 2, skipping=True, even=False).write())
     for word in ("row_1", "world", "view", "shading", "bricks +", "leap"):
         assert word in lit
         assert word not in unlit

@@ -1,7 +1,7 @@
-"""From a recipe to a function that can be called: LLVM through llvmlite, with the result kept on disk.
+"""From a variant to a function that can be called: LLVM through llvmlite, with the result kept on disk.
 
 Compiling takes a few tenths of a second, loading a few milliseconds. What a stored program is found by contains all
-that it depends on: the recipe, the text of `SOURCES`, LLVM's version, the machine.
+that it depends on: the variant, the text of `SOURCES`, LLVM's version, the machine.
 
 LLVM is only used aside (`threads`), one program after the other. There nothing can interrupt it, so that no lock of
 LLVM's is left locked and no program is half there; who is interrupted while waiting finds it made the next time. A fork
@@ -34,7 +34,7 @@ SOURCES = ("ops", "kernels.py", "prefilters.py", "volume.py")
 _Result = TypeVar("_Result")
 
 
-class Recipe(Hashable, Protocol):
+class Variant(Hashable, Protocol):
     """A frozen dataclass with everything that a program depends on, apart from the machine."""
 
     def generate(self) -> str:
@@ -42,14 +42,14 @@ class Recipe(Hashable, Protocol):
         ...
 
 
-_programs: dict[Recipe, Function] = {}
+_programs: dict[Variant, Function] = {}
 _signature = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 
 
-def compiled(recipe: Recipe) -> Function:
-    """The program of a recipe: from memory, from disk, or compiled now."""
-    found = _programs.get(recipe)
-    return found or _with_llvm(lambda: _made(recipe))
+def compiled(variant: Variant) -> Function:
+    """The program of a variant: from memory, from disk, or compiled now."""
+    found = _programs.get(variant)
+    return found or _with_llvm(lambda: _made(variant))
 
 
 def _with_llvm(use: Callable[[], _Result]) -> _Result:
@@ -62,15 +62,15 @@ def _with_llvm(use: Callable[[], _Result]) -> _Result:
     return threads.aside(alone)
 
 
-def _made(recipe: Recipe) -> Function:
-    if recipe not in _programs:  # two threads that ask for one program make it once
-        name = hashlib.sha256(repr((recipe, _surroundings())).encode()).hexdigest()[:40] + ".o"
+def _made(variant: Variant) -> Function:
+    if variant not in _programs:  # two threads that ask for one program make it once
+        name = hashlib.sha256(repr((variant, _surroundings())).encode()).hexdigest()[:40] + ".o"
         code = disk.read(name)
         if code is None:
-            code = _compile(recipe)
+            code = _compile(variant)
             disk.write(name, code)
-        _programs[recipe] = _load(code)
-    return _programs[recipe]
+        _programs[variant] = _load(code)
+    return _programs[variant]
 
 
 @cache
@@ -112,10 +112,10 @@ def _machine() -> llvm.TargetMachine:
     )
 
 
-def _compile(recipe: Recipe) -> bytes:
+def _compile(variant: Variant) -> bytes:
     """An object file. Our programs have vectors and loops as they should be: LLVM shall not rearrange them."""
     machine = _machine()
-    module = llvm.parse_assembly(recipe.generate())
+    module = llvm.parse_assembly(variant.generate())
     module.triple = machine.triple
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=2)

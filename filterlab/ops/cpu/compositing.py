@@ -32,7 +32,7 @@ from llvmlite import ir
 from filterlab.ops.cpu import frame, job, mathematics
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import DOUBLE, I64, POINTER, STORAGE, Lanes, Value
-from filterlab.ops.cpu.optics import Lights, Located, Steps, TransferTable, optical_depth, shade
+from filterlab.ops.cpu.optics import Lights, OnTable, Steps, TransferTable, optical_depth, shade
 from filterlab.ops.cpu.tape import Node, Tape
 from filterlab.ops.cpu.taps import Grid, Location, Taps
 from filterlab.ops.cpu.traversal import Ray, Run, Segments, State, Traversal
@@ -91,12 +91,12 @@ FIELDS: dict[str, type] = {
 _WRITTEN_OUT = 12  # rows times planes, see `Taps`
 
 
-class Job(job.Job):
+class MarchJob(job.Job):
     _fields_ = tuple(FIELDS.items())
 
 
 @dataclass(frozen=True)
-class Recipe:
+class MarchVariant:
     """Everything the program depends on, apart from the machine.
 
     Attributes:
@@ -183,35 +183,35 @@ class _Program:
     runs: int
     kept: tuple[str, ...]
 
-    def __init__(self, recipe: Recipe, function: ir.Function) -> None:
-        self.recipe, self.function = recipe, function
+    def __init__(self, variant: MarchVariant, function: ir.Function) -> None:
+        self.variant, self.function = variant, function
         self.builder = ir.IRBuilder(function.append_basic_block("entry"))
-        self.part = Lanes(self.builder, recipe.arithmetic, recipe.lanes)
-        self.run = Lanes(self.builder, recipe.arithmetic, 2 * recipe.lanes)
-        self.lanes = Lanes(self.builder, recipe.arithmetic, self.runs * self.run.count)
-        self.few = Lanes(self.builder, recipe.arithmetic, 4)  # for single numbers
-        self.storage = STORAGE[recipe.storage]
+        self.part = Lanes(self.builder, variant.arithmetic, variant.lanes)
+        self.run = Lanes(self.builder, variant.arithmetic, 2 * variant.lanes)
+        self.lanes = Lanes(self.builder, variant.arithmetic, self.runs * self.run.count)
+        self.few = Lanes(self.builder, variant.arithmetic, 4)  # for single numbers
+        self.storage = STORAGE[variant.storage]
 
     def write(self) -> None:
         e, b = self.lanes, self.builder
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         self.grid = Grid.of(j)
-        taps = self.of_coefficients(self.recipe.stencil)
+        taps = self.of_coefficients(self.variant.stencil)
         self.taps = _Parts(e, taps)
         steps = Steps(j.steps_low, j.steps_scale, j.steps_last)
         tables = j.opacities, j.colors, j.intervals, j.buckets
         self.table, self.table_of_run = (
-            TransferTable(lanes, self.recipe.interval, j.inner, *tables, steps) for lanes in (e, self.run)
+            TransferTable(lanes, self.variant.interval, j.inner, *tables, steps) for lanes in (e, self.run)
         )
         location = Location(self.run, taps.supports, self.storage, self.grid)
-        self.traversal = Traversal(location, j, self.kept, self.recipe.skipping)
+        self.traversal = Traversal(location, j, self.kept, self.variant.skipping)
         self.prepare()
         with frame.every_chunk(e, j) as chunk, self.traversal.every_block(chunk):
             self._march_block()
         b.ret_void()
 
     def of_coefficients(self, stencil: Lowered) -> Taps:
-        return Taps(self.part, stencil, self.storage, self.grid, self.recipe.room, written_out=_WRITTEN_OUT)
+        return Taps(self.part, stencil, self.storage, self.grid, self.variant.room, written_out=_WRITTEN_OUT)
 
     def _march_block(self) -> None:
         with self.traversal.every_ray() as (number, state):
@@ -238,9 +238,9 @@ class _Program:
 
     def uniform(self, ray: Ray) -> dict[str, list[Node]]:
         """What is the same all along a ray, by name of `march_derivatives.gradient_columns`; for a run."""
-        if not self.recipe.lit:
+        if not self.variant.lit:
             return {}
-        b, j, columns = self.builder, self.job, gradient_columns(self.recipe.lights)
+        b, j, columns = self.builder, self.job, gradient_columns(self.variant.lights)
         shading, view = (columns[name].stop - columns[name].start for name in ("shading", "view"))
         row = b.mul(ray.number, I64(view))
         return {
@@ -278,7 +278,7 @@ class _Program:
         return world
 
     def lights(self, uniform: dict[str, list[Node]]) -> Lights:
-        shading, view, count = uniform["shading"], uniform["view"], self.recipe.lights
+        shading, view, count = uniform["shading"], uniform["view"], self.variant.lights
         tints = [shading[2 + 3 * i : 5 + 3 * i] for i in range(2 * count)]
         vectors = [view[3 * i : 3 * i + 3] for i in range(2 * count)]
         return Lights(shading[0], shading[1], vectors[::2], vectors[1::2], tints[::2], tints[1::2])
@@ -310,7 +310,7 @@ class _Sample:
     """
 
     segments: Segments
-    located: Located
+    located: OnTable
     thickness: Node
     tau: Node
     ends: list[Node]
@@ -348,8 +348,8 @@ class _March(_Program):
 
     @contextmanager
     def _every_run(
-        self, first: Run, second: Run, weights: list[Value], located: Located, gradient: list[Node]
-    ) -> Iterator[tuple[Ray, Value, Located, list[Node]]]:
+        self, first: Run, second: Run, weights: list[Value], located: OnTable, gradient: list[Node]
+    ) -> Iterator[tuple[Ray, Value, OnTable, list[Node]]]:
         """For either run: the with-block, given its ray and its part of what was computed for both."""
         b, e, count = self.builder, self.lanes, self.run.count
         weight, place = e.kept(self.run.join(weights)), located.kept(e)
@@ -390,10 +390,10 @@ class _March(_Program):
         ]
         return [weights[0], e.where(e.everywhere(goes_on), weights[1], e.constant(0))]
 
-    def _add_light(self, ray: Ray, located: Located, gradient: list[Node], weight: Value, seen: Value) -> None:
+    def _add_light(self, ray: Ray, located: OnTable, gradient: list[Node], weight: Value, seen: Value) -> None:
         e, b, tape, table = self.run, self.builder, Tape(self.run), self.table_of_run
         color = table.color(tape, located, table.color_ends(located))
-        if self.recipe.lit:
+        if self.variant.lit:
             color = shade(tape, color, self.world_gradient(tape, gradient), self.lights(self.uniform(ray)))
         for name, own in zip(("red", "green", "blue"), color, strict=True):
             light = ray.state.kept[name]
@@ -412,18 +412,18 @@ class _Adjoint(_Program):
     kept = ("depth", "rest")
 
     def prepare(self) -> None:
-        e, recipe = self.lanes, self.recipe
-        number = STORAGE[recipe.arithmetic]
+        e, variant = self.lanes, self.variant
+        number = STORAGE[variant.arithmetic]
         self.spreading = self.taps
         if number != self.storage:  # derivatives by the coefficients are kept in the arithmetic's type
-            self.spreading = _Parts(e, Taps(self.part, recipe.stencil, number, self.grid))
-        if recipe.derivatives is not None:
-            self.raised = recipe.derivatives[1]
-            self.differentiating = _Parts(e, self.of_coefficients(recipe.derivatives[0]))
-        self.columns = gradient_columns(recipe.lights if recipe.lit else None)
+            self.spreading = _Parts(e, Taps(self.part, variant.stencil, number, self.grid))
+        if variant.derivatives is not None:
+            self.raised = variant.derivatives[1]
+            self.differentiating = _Parts(e, self.of_coefficients(variant.derivatives[0]))
+        self.columns = gradient_columns(variant.lights if variant.lit else None)
 
     def wants(self, name: str) -> bool:
-        return name in self.recipe.gradients
+        return name in self.variant.gradients
 
     def begin(self, number: Value, state: State) -> None:
         state.kept["depth"].value = DOUBLE(0.0)
@@ -461,7 +461,7 @@ class _Adjoint(_Program):
         return total
 
     @contextmanager
-    def _if_it_counts(self, located: Located, segments: Segments) -> Iterator[None]:
+    def _if_it_counts(self, located: OnTable, segments: Segments) -> Iterator[None]:
         """The with-block, unless the run has neither opacity nor derivatives."""
         if self.wants("table"):  # a control point's opacity counts where it is 0, too
             yield
@@ -477,13 +477,13 @@ class _Adjoint(_Program):
 
     # --- forwards again ---
 
-    def _sample(self, tape: Tape, ray: Ray, located: Located, rows: list[Node], segments: Segments) -> _Sample:
+    def _sample(self, tape: Tape, ray: Ray, located: OnTable, rows: list[Node], segments: Segments) -> _Sample:
         thickness = Node(segments.thickness)
         tau = optical_depth(tape, self.table.opacity(tape, located), thickness)
         ends = self.table.color_ends(located)
         color = self.table.color(tape, located, ends)
         uniform = self.uniform(ray)
-        if self.recipe.lit:
+        if self.variant.lit:
             color = shade(tape, color, self.world_gradient(tape, rows[1:4]), self.lights(uniform))
         return _Sample(segments, located, thickness, tau, ends, color, uniform)
 

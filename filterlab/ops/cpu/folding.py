@@ -31,7 +31,7 @@ FIELDS: dict[str, type] = {
     "next": ctypes.c_int64,  # the chunk to be taken next
     "points": ctypes.c_void_p,  # (M, 3)
     "located": ctypes.c_void_p,  # (M, 3)
-    "signs": ctypes.c_void_p,  # (M, 3); written if the recipe says so
+    "signs": ctypes.c_void_p,  # (M, 3); written if the variant says so
     "met": ctypes.c_void_p,  # one i64 per chunk: TURNED, LOST or both
     "count": ctypes.c_int64,  # M
     "chunk": ctypes.c_int64,  # packs of a chunk
@@ -44,12 +44,12 @@ FIELDS: dict[str, type] = {
 }
 
 
-class Job(job.Job):
+class FoldingJob(job.Job):
     _fields_ = tuple(FIELDS.items())
 
 
 @dataclass(frozen=True)
-class Recipe:
+class FoldingVariant:
     """Everything the program depends on, apart from the machine.
 
     Attributes:
@@ -74,10 +74,10 @@ class Recipe:
 
 
 class _Program:
-    def __init__(self, recipe: Recipe, function: ir.Function) -> None:
-        self.recipe, self.function = recipe, function
+    def __init__(self, variant: FoldingVariant, function: ir.Function) -> None:
+        self.variant, self.function = variant, function
         self.builder = ir.IRBuilder(function.append_basic_block("entry"))
-        self.lanes = Lanes(self.builder, recipe.arithmetic, recipe.lanes)
+        self.lanes = Lanes(self.builder, variant.arithmetic, variant.lanes)
 
     def write(self) -> None:
         e, b = self.lanes, self.builder
@@ -107,20 +107,20 @@ class _Program:
         folded = [self._fold(x, axis) for axis, x in enumerate(self._to_voxel(e.load_triples(points)))]
         shift = e.everywhere(e.scalar(j.shift))
         e.store_triples([e.subtract(x, shift) for x, _ in folded], located)
-        if self.recipe.signs:
+        if self.variant.signs:
             e.store_triples([sign for _, sign in folded], signs)
         with b.if_then(partial, likely=False):
             e.copy(own[1], self.copied[1], size)
-            if self.recipe.signs:
+            if self.variant.signs:
                 e.copy(own[2], self.copied[2], size)
 
     def _to_voxel(self, points: list[Value]) -> list[Value]:
         e, j = self.lanes, self.job
-        if self.recipe.affine == "identity":
+        if self.variant.affine == "identity":
             return points
         number = {name: e.everywhere(e.scalar(value)) for name, value in vars(j).items() if name[:6] in _AFFINE}
         moved = [e.subtract(x, number[f"origin_{a}"]) for a, x in zip(AXES, points, strict=True)]
-        if self.recipe.affine == "diagonal":
+        if self.variant.affine == "diagonal":
             return [e.multiply(x, number[f"matrix_{a}{a}"]) for a, x in zip(AXES, moved, strict=True)]
         rows = []
         for a in AXES:
@@ -136,13 +136,13 @@ class _Program:
         low, high = (e.everywhere(e.scalar(getattr(self.job, f"{end}_{AXES[axis]}"))) for end in ("low", "high"))
         folded, sign = e.variable(x), e.variable(e.constant(1))
         inside = b.and_(b.fcmp_ordered(">=", x, low), b.fcmp_ordered("<=", x, high))
-        if self.recipe.axes[axis] == "flat":
+        if self.variant.axes[axis] == "flat":
             inside = ir.Constant(ir.VectorType(I1, e.count), [False] * e.count)
         with b.if_then(b.not_(e.all(inside)), likely=False):
-            outside, turned = getattr(self, f"_{self.recipe.axes[axis]}")(x, low, high)
+            outside, turned = getattr(self, f"_{self.variant.axes[axis]}")(x, low, high)
             folded.value = b.select(inside, x, outside)
             sign.value = b.select(inside, e.constant(1), turned)
-            if self.recipe.axes[axis] != "wrap":
+            if self.variant.axes[axis] != "wrap":
                 self.met.value = b.or_(self.met.value, I64(TURNED))
             lost = b.select(e.any(b.fcmp_unordered("uno", outside, outside)), I64(LOST), I64(0))
             self.met.value = b.or_(self.met.value, lost)
@@ -166,7 +166,7 @@ class _Program:
 
     def _clamp(self, x: Value, low: Value, high: Value) -> tuple[Value, Value]:
         e, b = self.lanes, self.builder
-        if self.recipe.affine == "full":  # a sum that left the range of its type may have come back: ∞ + (∞ − ∞) = NaN
+        if self.variant.affine == "full":  # a sum that left the range of its type may have come back: ∞ + (∞ − ∞) = NaN
             x = e.add(x, e.subtract(x, x))
         below, above = b.fcmp_ordered("<", x, low), b.fcmp_ordered(">", x, high)
         constant = b.or_(below, above)

@@ -20,7 +20,7 @@ from filterlab.ops.cpu.job import AXES, Function
 from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, MOST_POINTS, lanes_of, threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh, zeros
 from filterlab.ops.cpu.order import Sorted
-from filterlab.ops.cpu.points import BLOCK, Job, Recipe
+from filterlab.ops.cpu.points import BLOCK, PointsJob, PointsVariant
 from filterlab.ops.gather import STORAGE, readable
 from filterlab.ops.stencil import Stencil
 
@@ -157,7 +157,7 @@ class Program:
     """
 
     run: Function
-    job: Job
+    job: PointsJob
     lanes: int
 
     @classmethod
@@ -180,9 +180,9 @@ class Program:
             raised: for pull, as in `Stencil.derivatives`.
         """
         lanes = lanes_of(dtype)
-        recipe = Recipe(operation, stencil.lowered, ARITHMETIC[dtype], STORAGE[volume.dtype], lanes, raised)
+        variant = PointsVariant(operation, stencil.lowered, ARITHMETIC[dtype], STORAGE[volume.dtype], lanes, raised)
         d, h, w = volume.shape[2:]
-        job = Job(
+        job = PointsJob(
             channels=volume.shape[1],
             width=w,
             height=h,
@@ -193,7 +193,7 @@ class Program:
         for axis, size, support in zip(AXES, (w, h, d), stencil.supports, strict=True):
             setattr(job, f"low_{axis}", start)
             setattr(job, f"high_{axis}", start + size - support)
-        return cls(compiler.compiled(recipe), job, lanes)
+        return cls(compiler.compiled(variant), job, lanes)
 
     def share(self, coefficients: Tensor, points: Tensor, rows: Tensor, gradient: Tensor | None = None) -> None:
         """gather or pull: all threads share the points, chunk by chunk.
@@ -230,7 +230,7 @@ class Program:
         most = max(1, MOST_POINTS // (self.lanes * BLOCK * self.job.channels))
         return -(-blocks // most)
 
-    def _described(self, points: Tensor, rows: Tensor, blocks: int) -> Job:
+    def _described(self, points: Tensor, rows: Tensor, blocks: int) -> PointsJob:
         """The job of these points in chunks of so many blocks."""
         entries, count = points.shape[:2]
         job = self.job.copy()
@@ -242,7 +242,7 @@ class Program:
         return job
 
 
-def _own_share(job: Job, first: int, parts: int, volume: Tensor) -> Job:
+def _own_share(job: PointsJob, first: int, parts: int, volume: Tensor) -> PointsJob:
     """The job of adding some parts of every batch entry's points to a volume of its own."""
     own = job.copy()
     own.point(coefficients=volume)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
-from filterlab.ops.cpu.compositing import TABLES, Job, Recipe
+from filterlab.ops.cpu.compositing import TABLES, MarchJob, MarchVariant
 from filterlab.ops.cpu.gather import SPLAT_MEMORY
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.machine import lanes_of
@@ -79,7 +79,7 @@ class _Run:
     def __init__(self, given: March, gradients: tuple[str, ...], arrays: Mapping[str, Tensor]) -> None:
         self.rays = len(given.chords.count)
         coefficients = given.coefficients.detach().resolve_neg().contiguous()
-        self.function = compiler.compiled(_recipe(given, gradients, coefficients))
+        self.function = compiler.compiled(_variant(given, gradients, coefficients))
         inputs = {"coefficients": coefficients, **given.inputs, **arrays}
         self.job = _job(given)
         if (steps := given.transfer.steps) is not None and steps.buckets is not None:
@@ -111,10 +111,10 @@ class _Run:
             report(min(first + RAYS_AT_ONCE, self.rays))
 
 
-def _job(given: March) -> Job:
+def _job(given: March) -> MarchJob:
     """With every number, and no address."""
     d, h, w = given.coefficients.shape
-    job = Job(
+    job = MarchJob(
         width=w,
         height=h,
         start=given.start,
@@ -136,9 +136,9 @@ def _job(given: March) -> Job:
     return job
 
 
-def _recipe(given: March, gradients: tuple[str, ...], coefficients: Tensor) -> Recipe:
+def _variant(given: March, gradients: tuple[str, ...], coefficients: Tensor) -> MarchVariant:
     raised = given.stencil.derivatives if "rays" in gradients else None
-    return Recipe(
+    return MarchVariant(
         gradients,
         given.stencil.lowered,
         None if raised is None else (raised[0].lowered, raised[1]),

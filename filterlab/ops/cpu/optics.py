@@ -50,7 +50,7 @@ WAYS = ("even", "compared", "bucketed")
 
 
 @dataclass(frozen=True)
-class Located:
+class OnTable:
     """Where values fall between control points.
 
     Attributes:
@@ -65,13 +65,13 @@ class Located:
     fraction: Node
     blue: list[Value] | None = None
 
-    def kept(self, lanes: Lanes) -> Callable[[Value, int], Located]:
+    def kept(self, lanes: Lanes) -> Callable[[Value, int], OnTable]:
         """Write it to memory; the result reads part number i of `count` lanes each. No derivatives are passed on."""
         packs = [lanes.kept(p) for p in (self.interval, self.fraction.value, *(self.blue or []))]
 
-        def part(i: Value, count: int) -> Located:
+        def part(i: Value, count: int) -> OnTable:
             interval, fraction, *blue = (pack.part(i, count) for pack in packs)
-            return Located(interval, [], Node(fraction), blue or None)
+            return OnTable(interval, [], Node(fraction), blue or None)
 
         return part
 
@@ -113,7 +113,7 @@ class TransferTable:
         self.lanes, self.way, self.inner, self.intervals = lanes, way, inner, intervals
         self.opacities, self.colors, self.buckets, self.steps = opacities, colors, buckets, steps
 
-    def locate(self, tape: Tape, value: Node) -> Located:
+    def locate(self, tape: Tape, value: Node) -> OnTable:
         """A NaN is looked up in the first interval, where its fraction is NaN."""
         if self.way == "even":
             return self._at_equal_steps(tape, value)
@@ -121,9 +121,9 @@ class TransferTable:
         ends = [Node(pack) for pack in packs]
         low, high, _, _ = ends
         fraction = tape.divide(tape.subtract(value, low), tape.subtract(high, low))
-        return Located(interval, ends, tape.clamp_fraction(fraction))
+        return OnTable(interval, ends, tape.clamp_fraction(fraction))
 
-    def _at_equal_steps(self, tape: Tape, value: Node) -> Located:
+    def _at_equal_steps(self, tape: Tape, value: Node) -> OnTable:
         e = self.lanes
         interval, t = self._step_of(value.value)
         number, scale = e.of_integer(interval), e.everywhere(e.scalar(self.steps.scale))
@@ -138,7 +138,7 @@ class TransferTable:
             (ends[0], e.multiply(e.subtract(w, e.constant(1)), scale)),
             (ends[1], e.negate(e.multiply(w, scale))),
         )
-        return Located(interval, ends, tape.clamp_fraction(fraction), [b0, b1])
+        return OnTable(interval, ends, tape.clamp_fraction(fraction), [b0, b1])
 
     def _step_of(self, value: Value) -> tuple[Value, Value]:
         """The number of a value's step, and t = (v − low) · scale."""
@@ -169,16 +169,16 @@ class TransferTable:
         ends = [e.where(beyond, right, left) for left, right in zip(first, second, strict=True)]
         return b.sub(e.to_integer(number), b.sext(beyond, ir.VectorType(I32, e.count))), ends
 
-    def opacity(self, tape: Tape, located: Located) -> Node:
+    def opacity(self, tape: Tape, located: OnTable) -> Node:
         return tape.blend(located.ends[2], located.ends[3], located.fraction)
 
-    def color_ends(self, located: Located) -> list[Node]:
+    def color_ends(self, located: OnTable) -> list[Node]:
         """r₀ r₁ g₀ g₁ b₀ b₁."""
         red_green = self._rows(self.colors, located.interval, COLOR_ROW, 0)
         blue = located.blue or self._rows(self.colors, located.interval, COLOR_ROW, 4)[:2]
         return [Node(pack) for pack in red_green + blue]
 
-    def color(self, tape: Tape, located: Located, ends: Sequence[Node]) -> list[Node]:
+    def color(self, tape: Tape, located: OnTable, ends: Sequence[Node]) -> list[Node]:
         return [tape.blend(ends[k], ends[k + 1], located.fraction) for k in (0, 2, 4)]
 
     def _rows(self, table: Value, interval: Value, width: int, first: int) -> list[Value]:

@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.cpu import compiler, threads
-from filterlab.ops.cpu.sorting import AXES, Job, Recipe
+from filterlab.ops.cpu.sorting import AXES, SortingJob, SortingVariant
 
 POINTS_AT_ONCE = 1 << 22  # points that are sorted together, for which copies of points and rows are held
 _EDGE = 8  # of a brick
@@ -94,11 +94,11 @@ class Sorted:
         job.point(rows=rows, sorted_rows=sorted_rows)
         self._run(step, job)
 
-    def _job(self, **fields) -> Job:
-        job = Job(count=self.count, chunks=1, **fields)
+    def _job(self, **fields) -> SortingJob:
+        job = SortingJob(count=self.count, chunks=1, **fields)
         job.point(brick=self._rank, begin=self._begin)
         return job
 
-    def _run(self, step: str, job: Job) -> None:
+    def _run(self, step: str, job: SortingJob) -> None:
         job.next = 0
-        threads.run(compiler.compiled(Recipe(step, self.arithmetic, self.lanes)), [job])
+        threads.run(compiler.compiled(SortingVariant(step, self.arithmetic, self.lanes)), [job])

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
-from filterlab.ops.cpu.folding import LOST, TURNED, Job, Recipe
+from filterlab.ops.cpu.folding import LOST, TURNED, FoldingJob, FoldingVariant
 from filterlab.ops.cpu.job import AXES, Function
 from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, MOST_POINTS, lanes_of, threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh
@@ -39,7 +39,7 @@ class Placing:
         geometry, boundary = self.placement.geometry, self.placement.boundary
         x, y, z = (_how_it_folds(boundary, n) for n in self.placement.size)
         affine = "identity" if geometry.is_identity else "full" if geometry.diagonal is None else "diagonal"
-        return compiler.compiled(Recipe((x, y, z), affine, signs, ARITHMETIC[self.dtype], self.lanes))
+        return compiler.compiled(FoldingVariant((x, y, z), affine, signs, ARITHMETIC[self.dtype], self.lanes))
 
     def __call__(self, points: Tensor) -> Placed:
         """(..., 3) to (located, sign)."""
@@ -75,10 +75,10 @@ class Placing:
         return located, sign
 
 
-def _job(placement: Placement) -> Job:
+def _job(placement: Placement) -> FoldingJob:
     """With everything but addresses and what the number of points decides."""
     geometry = placement.geometry
-    job = Job(shift=placement.shift)
+    job = FoldingJob(shift=placement.shift)
     for i, (a, n) in enumerate(zip(AXES, placement.size, strict=True)):
         setattr(job, f"origin_{a}", geometry.origin[i])
         low, high = placement.boundary.interval(n, placement.tail)

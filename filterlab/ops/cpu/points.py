@@ -44,12 +44,12 @@ FIELDS: dict[str, type] = {
 }
 
 
-class Job(job.Job):
+class PointsJob(job.Job):
     _fields_ = tuple(FIELDS.items())
 
 
 @dataclass(frozen=True)
-class Recipe:
+class PointsVariant:
     """Everything the program depends on, apart from the machine.
 
     Attributes:
@@ -76,19 +76,19 @@ class Recipe:
 
 
 class _Program:
-    def __init__(self, recipe: Recipe, function: ir.Function) -> None:
-        self.recipe, self.function = recipe, function
+    def __init__(self, variant: PointsVariant, function: ir.Function) -> None:
+        self.variant, self.function = variant, function
         self.builder = ir.IRBuilder(function.append_basic_block("entry"))
-        self.lanes = Lanes(self.builder, recipe.arithmetic, recipe.lanes)
-        self.storage = STORAGE[recipe.storage]
-        self.rows = len(recipe.raised[0] if recipe.raised else recipe.stencil.rows)  # J, as they lie in memory
+        self.lanes = Lanes(self.builder, variant.arithmetic, variant.lanes)
+        self.storage = STORAGE[variant.storage]
+        self.rows = len(variant.raised[0] if variant.raised else variant.stencil.rows)  # J, as they lie in memory
 
     def write(self) -> None:
         e = self.lanes
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         grid = Grid.of(j)
-        self.location = Location(e, self.recipe.stencil.supports, self.storage, grid)
-        self.taps = Taps(e, self.recipe.stencil, self.storage, grid)
+        self.location = Location(e, self.variant.stencil.supports, self.storage, grid)
+        self.taps = Taps(e, self.variant.stencil, self.storage, grid)
         self.scratch_points = e.reserve(e.number, 3 * e.count)
         self.scratch_rows = e.reserve(e.number, self.rows * e.count)
         self.addresses = e.reserve(I64, BLOCK * e.count)
@@ -130,11 +130,11 @@ class _Program:
         taps = [b.load(self._lane_of(self.addresses, index, lane, I64), typ=POINTER) for lane in range(e.count)]
         places = [self._lane_of(self.local, b.mul(index, I64(3)), axis * e.count, e.number) for axis in range(3)]
         u = [e.load(place, e.number, e.count) for place in places]
-        scatter = self.recipe.operation == "scatter"
+        scatter = self.variant.operation == "scatter"
         known = b.fcmp_ordered("ord", e.add(e.add(u[0], u[1]), u[2]), e.constant(0))
         weights = self.taps.weigh([b.select(known, own, e.constant(0)) for own in u] if scatter else u)
         window = _Window(self, pack)
-        pulled = [e.variable(e.constant(0)) for _ in range(3)] if self.recipe.operation == "pull" else []
+        pulled = [e.variable(e.constant(0)) for _ in range(3)] if self.variant.operation == "pull" else []
         with e.repeat(I64(0), j.channels) as channel:
             own_rows = e.advance(rows, e.product(channel, I64(self.rows), j.count), e.number)
             here = b.mul(channel, j.coefficients_channel)
@@ -150,7 +150,7 @@ class _Program:
 
     def _pull(self, pulled: list[Variable], cotangents: list[Value], derivatives: list[Value]) -> None:
         """pulled[axis] += Σ_rows cotangent · derivative of the row along the axis."""
-        for total, raised in zip(pulled, self.recipe.raised, strict=True):
+        for total, raised in zip(pulled, self.variant.raised, strict=True):
             for cotangent, row in zip(cotangents, raised, strict=True):
                 total.value = self.lanes.multiply_add(cotangent, derivatives[row], total.value)
 

@@ -17,7 +17,7 @@ from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, lanes_of, threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh
-from filterlab.ops.cpu.recursion import Job, Recipe
+from filterlab.ops.cpu.recursion import RecursionJob, RecursionVariant
 from filterlab.ops.gather import STORAGE
 from filterlab.ops.prefilter import Filtering
 
@@ -158,15 +158,15 @@ class _Filter:
     ) -> None:
         """Compile, add what all jobs need, and let the threads loose."""
         storage, arithmetic = STORAGE[source.dtype], ARITHMETIC[self.dtype]
-        recipe = Recipe(columns, len(self.poles), arithmetic, storage, self.lanes, self.packs)
-        function = compiler.compiled(recipe)
+        variant = RecursionVariant(columns, len(self.poles), arithmetic, storage, self.lanes, self.packs)
+        function = compiler.compiled(variant)
         longest = max(fields["count"], fields.get("count_y", 0))
         transposed = _rounded(int(longest + self.warm_up) * self.bundle, _ALIGNMENT)
         rows = _rounded(int(max(fields["width"], fields["count"])), self.lanes) if not columns else 0
         size = transposed + _rounded(rows * self.bundle, _ALIGNMENT)
         threads = self._threads(target.numel())
         scratch = _scratch(threads * size * self.dtype.itemsize)
-        job = Job(
+        job = RecursionJob(
             scratch_size=size,
             transposed=transposed,
             source_entry=source.stride(0),

@@ -64,12 +64,12 @@ FIELDS: dict[str, type] = {
 }
 
 
-class Job(job.Job):
+class RecursionJob(job.Job):
     _fields_ = tuple(FIELDS.items())
 
 
 @dataclass(frozen=True)
-class Recipe:
+class RecursionVariant:
     """Everything the program depends on, apart from the machine.
 
     Attributes:
@@ -126,18 +126,18 @@ class _Rows:
 
 
 class _Program:
-    def __init__(self, recipe: Recipe, function: ir.Function) -> None:
-        self.recipe, self.function = recipe, function
+    def __init__(self, variant: RecursionVariant, function: ir.Function) -> None:
+        self.variant, self.function = variant, function
         self.builder = ir.IRBuilder(function.append_basic_block("entry"))
-        self.lanes = Lanes(self.builder, recipe.arithmetic, recipe.lanes)
-        self.bundle = recipe.lanes * recipe.packs  # lines
-        self.storage, self.number = STORAGE[recipe.storage], STORAGE[recipe.arithmetic]
+        self.lanes = Lanes(self.builder, variant.arithmetic, variant.lanes)
+        self.bundle = variant.lanes * variant.packs  # lines
+        self.storage, self.number = STORAGE[variant.storage], STORAGE[variant.arithmetic]
 
     def write(self) -> None:
         e, b = self.lanes, self.builder
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         self.gain = e.everywhere(e.scalar(j.gain))
-        where = [e.advance(j.poles, I64(i), DOUBLE) for i in range(self.recipe.poles)]
+        where = [e.advance(j.poles, I64(i), DOUBLE) for i in range(self.variant.poles)]
         self.poles = [e.everywhere(e.scalar(b.load(address, typ=DOUBLE))) for address in where]
         self.no_gain = e.constant(1)
         self.zeros = e.reserve(e.number, self.bundle)  # the samples' own numbers are not larger
@@ -149,7 +149,7 @@ class _Program:
         self.transposed = e.advance(self.scratch, j.transposed, e.number)
         with frame.every_chunk(e, j) as chunk:
             first = b.mul(b.urem(chunk, j.parts), j.part)
-            write_chunk = self._filter_entry if self.recipe.columns else self._filter_plane
+            write_chunk = self._filter_entry if self.variant.columns else self._filter_plane
             write_chunk(b.udiv(chunk, j.parts), first)
         b.ret_void()
 
@@ -202,7 +202,7 @@ class _Program:
         b, lanes = self.builder, self.lanes.count
         bundled = b.sub(last, b.urem(b.sub(last, first), I64(self.bundle)))
         packed = b.sub(last, b.urem(b.sub(last, first), I64(lanes)))
-        ranges = [(first, bundled, self.recipe.packs), (bundled, packed, 1), (packed, last, 1)]
+        ranges = [(first, bundled, self.variant.packs), (bundled, packed, 1), (packed, last, 1)]
         for begin, end, packs in ranges:
             with self.lanes.repeat(begin, end, packs * lanes) as column:
                 mask = self.lanes.first_lanes(b.sub(last, column)) if begin is packed else None
@@ -225,7 +225,7 @@ class _Program:
             ):
                 b.store(e.advance(address, b.mul(line, stride), raw), e.advance(table, i, I64))
         self._every_tile(self.sources, j.width, self._transpose_in)
-        rows = _Rows(e, self.transposed, I64(self.bundle), self.number, self.recipe.packs)
+        rows = _Rows(e, self.transposed, I64(self.bundle), self.number, self.variant.packs)
         self._sweep(rows, rows, j.places, j.count, self.gain)
         self._every_tile(self.targets, j.count, self._transpose_out)
 

@@ -41,12 +41,12 @@ FIELDS: dict[str, type] = {
 }
 
 
-class Job(job.Job):
+class SortingJob(job.Job):
     _fields_ = tuple(FIELDS.items())
 
 
 @dataclass(frozen=True)
-class Recipe:
+class SortingVariant:
     """One pass.
 
     Attributes:

@@ -23,7 +23,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 from filterlab.ops.cuda import optics
-from filterlab.ops.cuda.optics import RGB, Located
+from filterlab.ops.cuda.optics import RGB, OnTable
 from filterlab.ops.cuda.segments import Program
 from filterlab.ops.cuda.source import Source
 from filterlab.ops.cuda.tape import Node, Tape
@@ -36,8 +36,8 @@ _ENDS = 10  # numbers of a row of the table that mean something
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """See `ops.cuda.segments.Recipe`.
+class AdjointVariant:
+    """See `ops.cuda.segments.RayVariant`.
 
     Attributes:
         gradients: what is asked, of `ops.march_derivatives.GRADIENTS`.
@@ -66,17 +66,17 @@ class Recipe:
 
 
 class _Adjoint(Program):
-    def __init__(self, recipe: Recipe) -> None:
-        super().__init__("adjoint", recipe)
-        self.recipe = recipe
+    def __init__(self, variant: AdjointVariant) -> None:
+        super().__init__("adjoint", variant)
+        self.variant = variant
         self.columns = {
             name: columns
-            for name, columns in gradient_columns(recipe.lights).items()
+            for name, columns in gradient_columns(variant.lights).items()
             if self.wants("shading" if name in ("shading", "view") else "rays")
         }
 
     def wants(self, name: str) -> bool:
-        return name in self.recipe.gradients
+        return name in self.variant.gradients
 
     def begin(self) -> None:
         """Cotangents; what is behind everything, g · light; the sums of a ray at 0."""
@@ -113,7 +113,7 @@ class _Adjoint(Program):
                 self._hold([*located.ends, *ends])
             self._go_back_to_points(rows, thickness)
 
-    def _if_it_counts(self, located: Located) -> AbstractContextManager[None]:
+    def _if_it_counts(self, located: OnTable) -> AbstractContextManager[None]:
         """The with-block, unless the segments have neither opacity nor derivatives."""
         if self.wants("table"):  # a control point's opacity counts where it is 0, too
             return nullcontext()
@@ -149,7 +149,7 @@ class _Adjoint(Program):
             self.line(f"held_{k} += tl.where(near, {end.adjoint}, 0.0)")
 
     def _let_go(self, mask: str) -> None:
-        self.line(f"table = tl.program_id(0).to(tl.int64) % {self.recipe.tables} * (inner_points + 1) + held")
+        self.line(f"table = tl.program_id(0).to(tl.int64) % {self.variant.tables} * (inner_points + 1) + held")
         for k in range(_ENDS):
             address = f"table_gradient + {TABLE_ROW} * table + {k}"
             self.line(f'tl.atomic_add({address}, held_{k}.to(tl.float64), {mask}, sem="relaxed")')
@@ -173,8 +173,8 @@ class _Adjoint(Program):
 
     def _go_back_to_rays(self, rows: Sequence[Node]) -> None:
         """Points are entry + t direction, t the middle of a segment; the last segment ends where the ray does."""
-        assert self.recipe.derivatives is not None
-        stencil, raised = self.recipe.derivatives
+        assert self.variant.derivatives is not None
+        stencil, raised = self.variant.derivatives
         taps = self.taps_of(stencil)
         taps.weigh()  # in place of the others, which are needed no more
         taps.contract("first", "slope")

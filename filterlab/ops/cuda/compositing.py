@@ -24,8 +24,8 @@ from filterlab.ops.stencil import Lowered
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """See `ops.cuda.segments.Recipe`."""
+class MarchVariant:
+    """See `ops.cuda.segments.RayVariant`."""
 
     stencil: Lowered
     lights: int | None

@@ -17,7 +17,7 @@ from torch import Tensor
 from filterlab.ops.cuda import adjoint as backward
 from filterlab.ops.cuda import compositing, segments
 from filterlab.ops.cuda.launch import interpreting, launchable
-from filterlab.ops.cuda.segments import Recipe, arrays_of
+from filterlab.ops.cuda.segments import RayVariant, arrays_of
 from filterlab.ops.march import March, Steps
 from filterlab.ops.march_derivatives import TABLE_ROW, by_name, columns_of_rays
 
@@ -30,8 +30,8 @@ def march(given: March, report: Report = lambda rays: None) -> tuple[Tensor, Ten
     light, depth = _zeros(given, rays, 3), _zeros(given, rays)
     if rays:
         even = given.transfer.even is not None
-        recipe = compositing.Recipe(given.stencil.lowered, given.lights, given.bricks is not None, even)
-        _launch(recipe, given, {"light": light, "optical_depth": depth})
+        variant = compositing.MarchVariant(given.stencil.lowered, given.lights, given.bricks is not None, even)
+        _launch(variant, given, {"light": light, "optical_depth": depth})
         report(rays)
     return light, depth
 
@@ -54,33 +54,35 @@ def adjoint(
     if rays and gradients:
         targets = {"coefficient_gradient": volume, "table_gradient": tables, "ray_gradient": by_ray}
         written = {name: target for name, target in targets.items() if target is not None}
-        _launch(_recipe_of_adjoint(given, gradients), given, {**arrays, **written})
+        _launch(_variant_of_adjoint(given, gradients), given, {**arrays, **written})
         report(rays)
     return by_name(gradients, volume, by_ray, tables.sum(0), points, given.lights)
 
 
-def _recipe_of_adjoint(given: March, gradients: tuple[str, ...]) -> backward.Recipe:
+def _variant_of_adjoint(given: March, gradients: tuple[str, ...]) -> backward.AdjointVariant:
     raised = given.stencil.derivatives if "rays" in gradients else None
     derivatives = None if raised is None else (raised[0].lowered, raised[1])
     skipping, even = given.bricks is not None, given.transfer.even is not None
-    return backward.Recipe(gradients, given.stencil.lowered, derivatives, given.lights, skipping, even, backward.TABLES)
+    return backward.AdjointVariant(
+        gradients, given.stencil.lowered, derivatives, given.lights, skipping, even, backward.TABLES
+    )
 
 
 def _zeros(given: March, *shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.zeros(shape, dtype=dtype, device=given.coefficients.device)
 
 
-def _launch(recipe: Recipe, given: March, own: Mapping[str, Tensor]) -> None:
+def _launch(variant: RayVariant, given: March, own: Mapping[str, Tensor]) -> None:
     """Run the program for all rays of a march.
 
     Args:
-        own: the arrays of `recipe.own`; contiguous where they are written.
+        own: the arrays of `variant.own`; contiguous where they are written.
     """
     arrays = {"coefficients": given.coefficients, **given.inputs, "numbers": _numbers(given), **own}
-    handed = [arrays[name].detach().resolve_neg().contiguous() for name in arrays_of(recipe)]
+    handed = [arrays[name].detach().resolve_neg().contiguous() for name in arrays_of(variant)]
     programs = -(-len(given.chords.count) // segments.BLOCK)
     with torch.cuda.device_of(handed[0]):  # Triton launches on the current device
-        _program(recipe, interpreting())[(programs,)](*handed, *_sizes(given), BLOCK=segments.BLOCK, num_warps=1)
+        _program(variant, interpreting())[(programs,)](*handed, *_sizes(given), BLOCK=segments.BLOCK, num_warps=1)
 
 
 def _numbers(given: March) -> Tensor:
@@ -101,5 +103,5 @@ def _sizes(given: March) -> tuple[int, ...]:
 
 
 @lru_cache(maxsize=256)
-def _program(recipe: Recipe, interpreted: bool) -> Any:
-    return launchable(recipe.write())
+def _program(variant: RayVariant, interpreted: bool) -> Any:
+    return launchable(variant.write())

@@ -19,7 +19,7 @@ RGB = range(3)
 
 
 @dataclass(frozen=True)
-class Located:
+class OnTable:
     """Where values fall between control points; the number of the row is `interval`.
 
     Attributes:
@@ -36,7 +36,7 @@ class Located:
         return " | ".join(f"({end} != 0.0)" for end in self.ends[2:]) + f" | ({self.fraction} != {self.fraction})"
 
 
-def locate(tape: Tape, value: Node, active: bool, even: bool) -> Located:
+def locate(tape: Tape, value: Node, active: bool, even: bool) -> OnTable:
     """A NaN is looked up in the first interval, where its fraction is NaN.
 
     Args:
@@ -47,7 +47,7 @@ def locate(tape: Tape, value: Node, active: bool, even: bool) -> Located:
     ends = [_loaded(tape, f"end_{k}", f"opacities + 4 * interval + {k}", active) for k in range(4)]
     low, high, _, _ = ends
     share = tape.divide("share", tape.subtract("above", value, low), tape.subtract("width_of_interval", high, low))
-    return Located(ends, tape.clamp_fraction("fraction", share))
+    return OnTable(ends, tape.clamp_fraction("fraction", share))
 
 
 def _step_of(source: Source, value: Node) -> None:
@@ -70,7 +70,7 @@ def _loaded(tape: Tape, name: str, address: str, active: bool) -> Node:
     return Node(name, active)
 
 
-def opacity(tape: Tape, located: Located) -> Node:
+def opacity(tape: Tape, located: OnTable) -> Node:
     return tape.blend("alpha", located.ends[2], located.ends[3], located.fraction)
 
 
@@ -79,7 +79,7 @@ def color_ends(tape: Tape, active: bool) -> list[Node]:
     return [_loaded(tape, f"color_end_{k}", f"colors + 8 * interval + {k}", active) for k in range(6)]
 
 
-def color(tape: Tape, located: Located, ends: Sequence[Node]) -> list[Node]:
+def color(tape: Tape, located: OnTable, ends: Sequence[Node]) -> list[Node]:
     return [tape.blend(f"color_{k}", ends[2 * k], ends[2 * k + 1], located.fraction) for k in RGB]
 
 

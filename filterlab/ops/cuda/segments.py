@@ -36,7 +36,7 @@ NUMBERS = ("step", "per_unit", "opaque", "slack", "infinity", "low", "scale", "l
 SIZES = ("rays", "depth", "height", "width", "start", "halvings", "inner_points", "bricks_y", "bricks_x", "edge")
 
 
-class Recipe(Protocol):
+class RayVariant(Protocol):
     """Everything a program depends on; can be hashed.
 
     Attributes:
@@ -60,12 +60,12 @@ class Recipe(Protocol):
     def write(self) -> Source: ...
 
 
-def arrays_of(recipe: Recipe) -> tuple[str, ...]:
+def arrays_of(variant: RayVariant) -> tuple[str, ...]:
     """The first parameters of a program; shapes as in `ops.cpu.compositing.FIELDS`."""
     rays = ("entry", "direction", "length", "offset", "count")
-    lit = () if recipe.lights is None else ("shading", "view", "world")
-    bricks = ("bricks",) if recipe.skipping else ()
-    return ("coefficients", *rays, "inner", "opacities", "colors", *lit, *bricks, "numbers", *recipe.own)
+    lit = () if variant.lights is None else ("shading", "view", "world")
+    bricks = ("bricks",) if variant.skipping else ()
+    return ("coefficients", *rays, "inner", "opacities", "colors", *lit, *bricks, "numbers", *variant.own)
 
 
 class Program:
@@ -75,11 +75,11 @@ class Program:
     segment's length in units of the opacity; and keep `passed`, the optical depth behind it.
     """
 
-    def __init__(self, name: str, recipe: Recipe) -> None:
-        self.source = Source(name, (*arrays_of(recipe), *SIZES, "BLOCK: tl.constexpr"))
+    def __init__(self, name: str, variant: RayVariant) -> None:
+        self.source = Source(name, (*arrays_of(variant), *SIZES, "BLOCK: tl.constexpr"))
         self.line = self.source.line
-        self.taps = self.taps_of(recipe.stencil)
-        self.lights, self.skipping, self.even = recipe.lights, recipe.skipping, recipe.even
+        self.taps = self.taps_of(variant.stencil)
+        self.lights, self.skipping, self.even = variant.lights, variant.skipping, variant.even
 
     def taps_of(self, stencil: Lowered) -> Taps:
         return Taps(self.source, stencil, WRITTEN_OUT)

@@ -47,7 +47,7 @@ def tap_weights(u: Tensor, function: Function, support: int) -> Taps:
     return {first + t: horner(row.unbind(0), u) for t, row in enumerate(rows.unbind(0))}
 
 
-class _Located:
+class _Reads:
     """Where a chunk of points reads, and with which weights.
 
     Attributes:
@@ -139,7 +139,7 @@ def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 
     flat = coefficients.transpose(0, 1).reshape(c, n * math.prod(coefficients.shape[2:]))
     parts = []
     for _, chunk, offset in _chunks(coefficients.shape, points):
-        parts.append(_contract(flat, _Located(chunk, offset, stencil, coefficients.shape, start), chunk.dtype))
+        parts.append(_contract(flat, _Reads(chunk, offset, stencil, coefficients.shape, start), chunk.dtype))
     rows = len(stencil.rows)
     if not parts:
         return points.new_zeros((n, c, rows, points.shape[1]))
@@ -147,7 +147,7 @@ def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 
     return out.reshape(rows, c, n, points.shape[1]).permute(2, 1, 0, 3)
 
 
-def _contract(flat: Tensor, at: _Located, dtype: torch.dtype) -> Tensor:
+def _contract(flat: Tensor, at: _Reads, dtype: torch.dtype) -> Tensor:
     """(J, C, M): taps summed along x, then y, then z (the sums along x serve every function along y and z)."""
     rows: dict[int, Tensor] = {}
     for z, lines in groupby(at.lines(), key=itemgetter(0)):
@@ -200,11 +200,11 @@ def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequenc
     for part, chunk, offset in _chunks(full, points):
         known = chunk.isfinite().all(-1)
         own = torch.where(known, flat[..., part].to(points.dtype), 0)
-        _spread(out, own, _Located(torch.where(known[:, None], chunk, 0), offset, stencil, full, start))
+        _spread(out, own, _Reads(torch.where(known[:, None], chunk, 0), offset, stencil, full, start))
     return out.reshape(c, n, *shape).transpose(0, 1)
 
 
-def _spread(out: Tensor, cotangents: Tensor, at: _Located) -> None:
+def _spread(out: Tensor, cotangents: Tensor, at: _Reads) -> None:
     """The three sums of `_contract` run backwards, in place on `out` (C, N·V); cotangents (J, C, M)."""
     for z, lines in groupby(at.lines(), key=itemgetter(0)):
         planes: dict[tuple[Function, Function], Tensor] = {}

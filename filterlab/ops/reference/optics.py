@@ -12,15 +12,15 @@ import torch
 from torch import Tensor
 
 
-class Located(NamedTuple):
+class OnTable(NamedTuple):
     """Where values fall between control points: interval `(...)` (integer) and fraction `(...)` in 0 … 1."""
 
     interval: Tensor
     fraction: Tensor
 
-    def at(self, index: Tensor) -> Located:
+    def at(self, index: Tensor) -> OnTable:
         """Those of some of the values `(S,)`."""
-        return Located(self.interval.index_select(0, index), self.fraction.index_select(0, index))
+        return OnTable(self.interval.index_select(0, index), self.fraction.index_select(0, index))
 
 
 class Table:
@@ -46,20 +46,20 @@ class Table:
         """True when some value has opacity 1."""
         return bool((self.opacities >= 1).any())
 
-    def locate(self, value: Tensor) -> Located:
+    def locate(self, value: Tensor) -> OnTable:
         """Between which control points the values `(...)` lie; the one search that opacity and colour share."""
         x = self.positions
         if len(x) == 1:
-            return Located(torch.zeros_like(value, dtype=torch.int32), torch.zeros_like(value) * value)
+            return OnTable(torch.zeros_like(value, dtype=torch.int32), torch.zeros_like(value) * value)
         interval = torch.searchsorted(x[1:-1].detach().contiguous(), value.detach(), right=True, out_int32=True)
         fraction = (value - _take(x[:-1], interval)) / _take(x.diff(), interval)
-        return Located(interval, fraction.clamp(0, 1))
+        return OnTable(interval, fraction.clamp(0, 1))
 
-    def opacity(self, located: Located) -> Tensor:
+    def opacity(self, located: OnTable) -> Tensor:
         """Opacities per unit, `(...)`."""
         return _interpolated(self.opacities, located.interval, located.fraction)
 
-    def color(self, located: Located) -> Tensor:
+    def color(self, located: OnTable) -> Tensor:
         """Linear RGB, `(..., 3)`."""
         return _interpolated(self.colors, located.interval, located.fraction[..., None])
 
