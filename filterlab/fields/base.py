@@ -11,6 +11,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from filterlab.ops.pieces import Pieces
 from filterlab.volume import Geometry
 
 
@@ -88,6 +89,29 @@ class Field(ABC):
     scheme: Named = ClosedForm()
     max_order: int = 2
     channels: tuple[int, int] | None = None
+
+    @property
+    def degree_along_rays(self) -> int | None:
+        """The degree of this field's pieces along a ray; None where it is not piecewise polynomial."""
+        return None
+
+    def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
+        """The exact pieces of the field on the parts of rays that lie in its domain.
+
+        Where `degree_along_rays` is a number n, f(o + t d) is a row of polynomials of degree n in t. Neighbouring
+        pieces share their end values bit by bit, unless the field itself jumps.
+
+        Args:
+            origins, directions: (R, 3) world points, and directions of any length; nothing behind an origin is seen.
+            level: when given, parts in which the field surely differs from it are left out.
+
+        Returns:
+            the pieces, in promote(origins, directions, float32); places along rays are float64. Not differentiable.
+
+        Raises:
+            TypeError: the field is not piecewise polynomial. ValueError: it is batched.
+        """
+        raise TypeError(f"{type(self).__name__} ({self.scheme.name}) is not piecewise polynomial along rays")
 
     @abstractmethod
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:

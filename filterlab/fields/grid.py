@@ -16,10 +16,14 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Domain, Field, check_order, check_points
+from filterlab.fields.ranges import ranges
 from filterlab.fields.storage import Quantization, stored_as
 from filterlab.kernels import Factor, PiecewisePolynomial
 from filterlab.ops.differentiable.prefilter import implementation_for, prefilter_samples
+from filterlab.ops.pieces import Lattice, Pieces
 from filterlab.ops.place import Placement
+from filterlab.ops.reference.pieces import pieces_of_rays
+from filterlab.ops.stencil import Product, Stencil
 from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary, Geometry, Volume
 
@@ -41,6 +45,7 @@ class Scheme(Protocol):
         max_order: the highest derivative it gives.
         reach: coefficients needed on each side of a point's cell.
         terms: the value as a sum of separable terms (what `resample` uses).
+        exact: whether the value is that sum but for rounding: not where a texture unit's fractions are modelled.
     """
 
     @property
@@ -53,6 +58,8 @@ class Scheme(Protocol):
     def reach(self) -> int: ...
     @property
     def terms(self) -> tuple[Term, ...]: ...
+    @property
+    def exact(self) -> bool: ...
 
     def evaluation(self, coefficients: Coefficients, placement: Placement, order: int) -> Evaluation:
         """What gives the jet of that order of coefficients (N, C, D', H', W'); all that no point changes is settled.
@@ -136,6 +143,23 @@ class Coefficients:
         """The coefficients as numbers of a floating type."""
         values = self.values
         return values.to(dtype) if self.quantization is None else self.quantization.decoded(values, dtype)
+
+    def lattice(self, terms: tuple[Term, ...]) -> Lattice:
+        """The cells that the domain meets, of the sum over terms; of coefficients (D', H', W').
+
+        Inside of the domain no point is folded: the padding holds every tap.
+        """
+        row = tuple(Product(term.kernels, weight=term.weight) for term in terms)
+        values, offset = self.values, []
+        for axis, (n, support) in enumerate(zip(self.size, Stencil((row,)).supports, strict=True)):
+            zero = self.start + self.shift + support / 2 - 1  # where the first cell of all begins
+            first, last = math.floor(-0.5 - zero), math.ceil(n - 0.5 - zero)
+            values = values.narrow(-1 - axis, first, last - first + support - 1)
+            offset.append(first + zero)
+        (x, y, z), (w, h, d) = offset, self.size
+        lower, upper = (-0.5 - x, -0.5 - y, -0.5 - z), (w - 0.5 - x, h - 0.5 - y, d - 0.5 - z)
+        scale, shift = (1.0, 0.0) if self.quantization is None else self.quantization.numbers()
+        return Lattice(values, row, (x, y, z), lower, upper, scale, shift)
 
     def placement(self, geometry: Geometry) -> Placement:
         """How world points become coordinates of these coefficients."""
@@ -249,6 +273,29 @@ class GridField(Field):
         moved.domain = self.domain.relative_to(origin)
         moved._settle()
         return moved
+
+    @property
+    def degree_along_rays(self) -> int | None:
+        return self.lattice.degree if self.scheme.exact and self.channels is None else None
+
+    @property
+    def lattice(self) -> Lattice:
+        """The cells on which this field is one polynomial each; of an unbatched field."""
+        return self.coefficients.lattice(self.scheme.terms)
+
+    def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
+        if self.channels is not None:
+            raise ValueError("pieces are those of one channel: `select` it from this batched field")
+        if not self.scheme.exact:
+            return super().pieces_along(origins, directions, level)
+        dtype = torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
+        lattice, geometry = self.lattice, self.domain.geometry
+        own = geometry.to_voxel(origins.detach().double()), geometry.direction_to_voxel(directions.detach().double())
+        rays = own[0] - own[0].new_tensor(lattice.offset), own[1]
+        if level is None or not lattice.continuous:  # a jump may lie between bricks that hold no level
+            return pieces_of_rays(rays, lattice, dtype)
+        bounds = ranges(lattice)
+        return pieces_of_rays(rays, lattice, dtype, bounds.edge, bounds.may_hold(level, dtype))
 
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         check_order(order, self.max_order)

@@ -44,6 +44,10 @@ class Quantization:
     def __getitem__(self, index: tuple[int, int]) -> Quantization:
         return Quantization(self.scale[index], self.offset[index])
 
+    def numbers(self) -> tuple[float, float]:
+        """(scale, offset), of an unbatched field."""
+        return float(self.scale), float(self.offset)
+
     def decoded(self, stored: Tensor, dtype: torch.dtype) -> Tensor:
         """The coefficients `(..., D, H, W)` of stored numbers."""
         return self._like(self.scale, stored, dtype) * stored.to(dtype) + self._like(self.offset, stored, dtype)

@@ -115,6 +115,7 @@ class Direct:
     terms: tuple[Term, ...]
     name: str = "direct"
     gradient: str = "analytic"
+    exact: bool = True
 
     def __post_init__(self) -> None:
         _ = self.stencils  # made now: torch.compile can't make them while it traces
@@ -148,6 +149,12 @@ class Direct:
 
 class Sampled(ABC):
     """A scheme that places points and takes trilinear samples of the coefficients there."""
+
+    sample: Sampler
+
+    @property
+    def exact(self) -> bool:
+        return self.sample is exact_sample
 
     @abstractmethod
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:

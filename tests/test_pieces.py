@@ -1,0 +1,261 @@
+"""Pieces of fields along rays: exact, without a gap, equal where they meet; and bounds of values by brick."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import filterlab as fl
+from filterlab import bernstein, kernels
+from filterlab.fields import ranges as bounds
+from filterlab.kernels import KERNELS
+from filterlab.methods import METHODS, from_kernel
+from tests import oracles
+
+BOUNDARIES = [str(b) for b in fl.Boundary]
+AFFINE = np.array([[1.0, 0.2, 0.0, 3.0], [0.0, 0.5, 0.1, 1.0], [0.1, 0.0, 2.0, -5.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def samples(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def rays(field, count: int = 40, seed: int = 1) -> tuple[Tensor, Tensor]:
+    """Rays from around towards the middle half of the domain; directions of any length."""
+    random = np.random.default_rng(seed)
+    center, size = np.array(field.domain.center), field.domain.diagonal
+    origins = center + random.normal(size=(count, 3)) * size
+    targets = center + random.uniform(-0.25, 0.25, (count, 3)) * size
+    directions = (targets - origins) * random.uniform(0.1, 10, (count, 1))
+    return torch.from_numpy(origins), torch.from_numpy(directions)
+
+
+def awkward_rays(field) -> tuple[Tensor, Tensor]:
+    """Parallel to axes of the voxels, in planes of knots, through edges and corners of cells, from inside, from far."""
+    n = np.array(field.coefficients.size)
+    rows = []
+    for axis in range(3):
+        for where in ((1.0, 1.0), (1.5, 2.0), (0.3, 1.5), (0.0, -0.4), (2.5, 2.5)):
+            origin, step = np.insert(np.array(where), axis, -3.0), np.eye(3)[axis]
+            rows += [(origin, step), (origin + step * (n[axis] + 6), -step)]
+    rows += [(np.full(3, -2.0), np.ones(3)), (n + 1.0, -np.ones(3)), (np.array([-2.5, -2, 1.0]), np.array([1.0, 1, 0]))]
+    rows += [(np.array([1.0, 1, 1]), np.array([1.0, 0.5, 0.25])), (np.array([1.2, 2.5, 1]), np.array([-1.0, -1, -1]))]
+    rows += [(np.array([1e6, 2e6, -1e6]) + 1.3, np.array([-1.0, -2, 1]))]
+    voxels, steps = (torch.from_numpy(np.array(x)) for x in zip(*rows, strict=True))
+    geometry = field.domain.geometry
+    return geometry.to_world(voxels), geometry.to_world(voxels + steps) - geometry.to_world(voxels)
+
+
+def values_of(pieces, within: Tensor) -> Tensor:
+    return bernstein.evaluate(pieces.coefficients[:, None], bernstein.on_interval(within.to(pieces.coefficients)))
+
+
+def points_of(pieces, origins: Tensor, directions: Tensor, within: Tensor) -> Tensor:
+    return origins[pieces.ray][:, None] + pieces.t(within)[..., None] * directions[pieces.ray][:, None]
+
+
+def voxels_of(points: Tensor) -> np.ndarray:
+    return (points.numpy().reshape(-1, 3) - AFFINE[:3, 3]) @ np.linalg.inv(AFFINE[:3, :3]).T
+
+
+def within(pieces, count: int = 3) -> Tensor:
+    return torch.rand(len(pieces.ray), count, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+@pytest.mark.parametrize("method", METHODS)
+def test_pieces_are_the_field_as_its_definition_gives_it(method, boundary):
+    volume = fl.Volume(samples(4, 5, 6), affine=AFFINE)
+    field = fl.reconstruct(volume, method, boundary=boundary)
+    origins, directions = rays(field)
+    pieces = field.pieces_along(origins, directions)
+    assert pieces.coefficients.shape == (len(pieces.ray), field.degree_along_rays + 1)
+    assert len(pieces.ray) > 100
+    at = within(pieces)
+    points = voxels_of(points_of(pieces, origins, directions, at))
+    expected = oracles.reconstruct(method, volume.samples.numpy(), points, boundary, order=0)[0]
+    assert np.abs(values_of(pieces, at).numpy().reshape(-1) - expected).max() < 2e-13
+
+
+DEGREES = {"trilinear": 3, "ncrsi": 5, "triquadratic": 6, "notch": 6, "catmull-rom": 9, "mitchell": 9, "tricubic": 9}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_degrees_along_rays(method):
+    assert fl.reconstruct(samples(3, 3, 3), method).degree_along_rays == DEGREES[method]
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+@pytest.mark.parametrize("name", KERNELS)
+def test_pieces_of_every_kernel(name, boundary):
+    volume = fl.Volume(samples(3, 4, 5))
+    field = fl.reconstruct(volume, from_kernel(KERNELS[name]), boundary=boundary, prefilter=False, scheme="direct")
+    origins, directions = rays(field, 12)
+    pieces = field.pieces_along(origins, directions)
+    at = within(pieces)
+    points = points_of(pieces, origins, directions, at).numpy().reshape(-1, 3)
+    expected = oracles.tensor_product(volume.samples.numpy(), points, oracles.PIECES[name], (), boundary, 0)[0]
+    assert np.abs(values_of(pieces, at).numpy().reshape(-1) - expected).max() < 2e-13
+
+
+def test_pieces_of_a_kernel_that_is_a_tensor():
+    field = fl.reconstruct(samples(4, 4, 4), kernels.bc(torch.tensor(0.3, dtype=torch.float64), 0.2), prefilter=False)
+    origins, directions = rays(field)
+    pieces = field.pieces_along(origins, directions)
+    at = within(pieces)
+    expected = field(points_of(pieces, origins, directions, at)).detach()
+    assert float((values_of(pieces, at) - expected).abs().max()) < 1e-12
+    assert torch.equal(pieces.coefficients[1:][pieces.joined[1:], 0], pieces.coefficients[:-1][pieces.joined[1:], -1])
+
+
+@pytest.mark.parametrize("storage", ["float16", "bfloat16", "float32", "int16", "uint8"])
+@pytest.mark.parametrize("method", METHODS)
+def test_storage(method, storage):
+    field = fl.reconstruct(100 + 7 * samples(4, 5, 6), method, storage=storage)
+    origins, directions = rays(field)
+    pieces = field.pieces_along(origins, directions)
+    at = within(pieces)
+    expected = field(points_of(pieces, origins, directions, at))
+    assert float((values_of(pieces, at) - expected).abs().max()) < 1e-11
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+@pytest.mark.parametrize("method", METHODS)
+def test_pieces_cover_the_domain_and_share_their_ends(method, boundary):
+    """Without gap or overlap from where a ray enters to where it leaves, and equal to the bit where two meet."""
+    field = fl.reconstruct(fl.Volume(samples(4, 5, 6), affine=AFFINE), method, boundary=boundary)
+    for origins, directions in (rays(field), awkward_rays(field)):
+        pieces = field.pieces_along(origins, directions)
+        joined = pieces.joined
+        assert int((~joined).sum()) == len(pieces.ray.unique())
+        assert bool((pieces.near <= pieces.far).all())
+        first, last = ~joined, torch.cat((~joined[1:], torch.ones(1, dtype=torch.bool)))
+        for side, at in ((first, pieces.near), (last, pieces.far)):
+            t = (pieces.start[pieces.ray] + at)[side, None]
+            voxels = voxels_of(origins[pieces.ray[side]] + t * directions[pieces.ray[side]])
+            middle = np.abs(voxels - (np.array([6, 5, 4]) - 1) / 2) - np.array([6, 5, 4]) / 2
+            outside = np.abs(middle.max(-1))
+            inside = (t.numpy()[:, 0] == 0) & (middle.max(-1) < 0)
+            assert (inside | (outside < 1e-9)).all()  # the far origin's own rounding is 1e-10
+        assert torch.equal(pieces.coefficients[1:][joined[1:], 0], pieces.coefficients[:-1][joined[1:], -1])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_pieces_of_awkward_rays(method):
+    field = fl.reconstruct(fl.Volume(samples(4, 5, 6), affine=AFFINE), method)
+    origins, directions = awkward_rays(field)
+    pieces = field.pieces_along(origins, directions)
+    assert len(pieces.ray.unique()) == len(origins)
+    at = within(pieces)
+    expected = field(points_of(pieces, origins, directions, at))
+    near = (pieces.ray < len(origins) - 1)[:, None]
+    error = (values_of(pieces, at) - expected).abs()
+    assert float((error * near).max()) < 1e-13
+    assert float(error.max()) < 1e-8  # from afar: the rounding of o + t d itself
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_float32_is_rounded_only(method):
+    field = fl.reconstruct(samples(6, 6, 6), method, boundary="reflect")
+    origins, directions = (x.float() for x in rays(field))
+    pieces = field.pieces_along(origins, directions)
+    exact = field.pieces_along(origins.double(), directions.double())
+    assert pieces.coefficients.dtype == torch.float32
+    assert torch.equal(pieces.ray, exact.ray)
+    largest = float(field.coefficients.values.abs().max())
+    assert float((pieces.coefficients - exact.coefficients).abs().max()) < 3e-6 * largest
+
+
+def test_a_ray_that_misses_or_leaves_has_no_pieces():
+    field = fl.reconstruct(samples(4, 4, 4), "tricubic")
+    origins = torch.tensor([[-5.0, 0, 0], [-5.0, 9, 0], [-5.0, 1, 1]])
+    directions = torch.tensor([[-1.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0]])
+    pieces = field.pieces_along(origins, directions)
+    assert pieces.ray.unique().tolist() == [2]
+    assert field.pieces_along(origins[:0], directions[:0]).coefficients.shape == (0, 10)
+
+
+def test_who_has_no_pieces_says_so():
+    ray = torch.zeros(1, 3), torch.ones(1, 3)
+    with pytest.raises(TypeError, match="not piecewise polynomial"):
+        fl.signals.marschner_lobb().pieces_along(*ray)
+    texture = fl.reconstruct(samples(3, 3, 3), "triquadratic", scheme="eight_trilinear", sampler="texture_unit")
+    assert texture.degree_along_rays is None
+    with pytest.raises(TypeError, match="not piecewise polynomial"):
+        texture.pieces_along(*ray)
+    batched = fl.reconstruct(samples(2, 1, 3, 3, 3), "triquadratic")
+    with pytest.raises(ValueError, match="select"):
+        batched.pieces_along(*ray)
+    assert batched.select(1, 0).pieces_along(*ray).ray.numel()
+
+
+# ---- bounds by brick
+
+
+def straddling(pieces, level: float) -> list[tuple[int, float, float]]:
+    c = pieces.coefficients
+    mask = (c.amin(-1) <= level) & (c.amax(-1) >= level)
+    return [(int(r), float(a), float(b)) for r, a, b in zip(*(x[mask] for x in pieces[:3]), strict=True)]
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+@pytest.mark.parametrize("method", METHODS)
+def test_bounds_hold_everywhere_in_a_brick(method, boundary):
+    field = fl.reconstruct(fl.Volume(samples(9, 7, 6)), method, boundary=boundary, storage="int16")
+    lattice = field.lattice
+    found = bounds.ranges(lattice, 4)
+    points = torch.rand(20_000, 3, dtype=torch.float64) * torch.tensor(field.coefficients.size) - 0.5
+    brick = ((points - torch.tensor(lattice.offset, dtype=torch.float64)) / 4).floor().long().unbind(-1)[::-1]
+    values = field(points)
+    assert bool((found.low[brick] <= values + 1e-12).all())
+    assert bool((found.high[brick] >= values - 1e-12).all())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_piece_that_may_hold_the_level_is_left_out(method):
+    field = fl.reconstruct(samples(12, 11, 10) ** 6, method)
+    origins, directions = rays(field, 60)
+    for level in (-0.05, 0.0, 0.3, 0.9):
+        every, some = field.pieces_along(origins, directions), field.pieces_along(origins, directions, level)
+        assert straddling(some, level) == straddling(every, level)
+    assert len(field.pieces_along(origins, directions, 99).ray) == 0
+
+
+@pytest.mark.parametrize("edge", [1, 3, 4])
+@pytest.mark.parametrize("name", ["linear", "bspline0", "bspline2", "bspline3", "catmull-rom", "notch"])
+def test_bounds_are_the_hulls_of_the_cells(name, edge):
+    """Every cell's own Bernstein coefficients, one cell at a time, by the definition of a hull."""
+    field = fl.reconstruct(samples(4, 5, 6), from_kernel(KERNELS[name]), prefilter=False, scheme="direct")
+    lattice = field.lattice
+    found = bounds.ranges(lattice, edge)
+    low, high = torch.full_like(found.low, math.inf), torch.full_like(found.high, -math.inf)
+    kernel = lattice.row[0].kernels[0]
+    table = bernstein.from_monomial(kernel.taps(torch.float64))
+    for z, y, x in np.ndindex(*lattice.cells[::-1]):
+        taps = lattice.coefficients[z : z + len(table), y : y + len(table), x : x + len(table)]
+        hull = torch.einsum("kji,ka,jb,ic->abc", taps, table, table, table)
+        brick = (z // edge, y // edge, x // edge)
+        low[brick], high[brick] = torch.minimum(low[brick], hull.min()), torch.maximum(high[brick], hull.max())
+    assert float((found.low - low).abs().max()) < 1e-14
+    assert float((found.high - high).abs().max()) < 1e-14
+
+
+def test_bounds_see_what_is_written_to_coefficients():
+    field = fl.reconstruct(samples(5, 5, 5), "trilinear")
+    assert float(bounds.ranges(field.lattice).high.max()) < 2
+    field.coefficients.values[3, 3, 3] = 9
+    assert float(bounds.ranges(field.lattice).high.max()) == 9
+
+
+def test_bounds_of_what_is_not_finite_are_none():
+    s = samples(12, 12, 12)
+    s[9, 9, 9] = math.nan
+    field = fl.reconstruct(s, "tricubic", nan="propagate")
+    found = bounds.ranges(field.lattice)
+    assert bool(found.low.isnan().any())
+    assert not bool(found.low.isnan().all())
+    assert torch.equal(found.may_hold(50.0, torch.float64), found.low.isnan())
