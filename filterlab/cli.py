@@ -43,20 +43,22 @@ class UsageError(ValueError):
 
 @dataclass(frozen=True)
 class Render:
-    """Make a picture of a volume or a signal, as a scene file describes it.
+    """Make a picture of a volume or a signal, as a scene file describes it; or of the surface at a level in a volume.
 
-    A scene is a YAML file: what is shown, how it is reconstructed, the transfer function, the camera, the lights. Any
-    of its values can be changed on the command line, after the name of the scene, by its path in the file.
+    A scene is a YAML file: what is shown, how it is reconstructed, the transfer function or the surface, the camera,
+    the lights. Any of its values can be changed on the command line, after the name of the scene, by its path in the
+    file. In place of a scene, a volume file and --level are enough for a surface.
 
     examples:
       filterlab render engine.yaml -o engine.png
       filterlab render engine.yaml -o notch.png --method notch --size 512 512
       filterlab render engine.yaml -o zoom.png --camera.window 0.4 0.4 0.6 0.6 --volume other.nrrd
       filterlab render engine.yaml --explain
+      filterlab render engine.nrrd --level 90 -o surface.png --surface.material toon
     """
 
-    scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml")]
-    """The scene."""
+    scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml | VOLUME")]
+    """The scene, or a volume with --level."""
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
     """The picture to write: a name that ends in .png."""
     explain: bool = False
@@ -68,9 +70,12 @@ class Render:
         if self.output is not None:
             self._check_output(self.output)
 
-        from filterlab.scenes.build import load_scene
+        from filterlab.scenes.build import load_scene, surface_scene
 
-        scene = load_scene(self.scene, overrides)
+        level = overrides.pop("level", None)
+        if level is None and self.scene.suffix.lower() not in (".yaml", ".yml", "") and self.scene.is_file():
+            raise ValueError(f"expected a scene, a .yaml file; for the surface in a volume add --level: {self.scene}")
+        scene = load_scene(self.scene, overrides) if level is None else surface_scene(self.scene, level, overrides)
         if scene.volume is not None and self.output is not None:
             _check_not_input(self.output, Path(scene.volume.file))
         _check_device(scene.device)

@@ -410,6 +410,29 @@ def test_render_of_a_volume_file(scene_file: Path, volume_file: Path, tmp_path: 
     assert load_image(tmp_path / "a.png").std() > 0.01
 
 
+def test_render_of_a_surface_needs_a_volume_and_a_level(
+    volume_file: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.png"
+    line = ["render", str(volume_file), "--level", "40", "-o", str(out), "--size", "24", "16"]
+    assert main([*line, "--surface.subpixels", "1"]) == 0
+    image = load_image(out)
+    assert image.shape == (16, 24, 3)
+    assert image.std() > 0.02
+    assert main(["render", str(volume_file), "--level", "40", "--size", "8", "6", "--explain"]) == 0
+    assert "cells may hold the level" in capfd.readouterr().out
+
+
+def test_mistakes_about_levels_are_named(capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.png"
+    fails(capsys, ["render", volume_file, "-o", out], 1, "expected a scene", "add --level")
+    fails(capsys, ["render", volume_file, "--level", "high", "-o", out], 1, "surface.level: expected a valid number")
+    fails(capsys, ["render", tmp_path / "no.nrrd", "--level", "1", "-o", out], 1, "found none at")
+    fails(capsys, ["render", volume_file, "--level", "1", "--step", "1", "-o", out], 1, "hit exactly")
+    fails(capsys, ["render", volume_file, "--level", "1", "--surface.material", "tooon", "-o", out], 1, "'toon'")
+    assert not out.exists()
+
+
 def test_render_refuses_before_it_works(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene_file: Path, tmp_path: Path
 ) -> None:

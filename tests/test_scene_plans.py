@@ -17,7 +17,7 @@ from filterlab.io.config import ConfigError, loads_config
 from filterlab.scenes import build as building
 from filterlab.scenes.build import build
 from filterlab.scenes.model import Scene
-from filterlab.scenes.plan import plan
+from filterlab.scenes.plan import SurfacePlan, plan
 from filterlab.scenes.plan_report import table
 
 BASE = """
@@ -223,3 +223,16 @@ def test_an_image_takes_the_memory_that_is_said(memory: int) -> None:
     assert image == image_said == 16 * 1200 * 1000
     # 16 MiB for what the allocator and the threads take
     assert 0.5 * image < peak <= image + rays_said + 2**24
+
+
+def test_the_plan_of_a_surface_counts_what_may_hold_the_level() -> None:
+    text = "signal: {name: marschner-lobb, samples: 16}\nsurface: {level: 0.5, material: {kind: toon, contour: 0.1}}\n"
+    prepared = build(loads_config(text + "size: [40, 30]\n", Scene))
+    found = plan(prepared)
+    assert isinstance(found, SurfacePlan)
+    assert (found.method, found.degree, found.order, found.rays) == ("triquadratic", 6, 2, 1200)
+    assert 16**2 < found.cells <= found.pieces < 17**3
+    assert found.seconds.low > 0
+    assert found.image_bytes == 1200 * 16
+    assert any("shadows" in line for line in found.absent)
+    assert table(found).row_count > 6

@@ -8,13 +8,23 @@ import torch
 
 from filterlab import signals
 from filterlab.fields.base import Field
-from filterlab.io import save_volume
+from filterlab.io import save_image, save_volume
 from filterlab.io.config import ConfigError, dump_config
 from filterlab.methods import reconstruct
 from filterlab.ops.differentiable import march
-from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
-from filterlab.scenes.build import build, load_scene, render_scene
-from filterlab.scenes.model import find_volume
+from filterlab.render import (
+    Light,
+    OrthographicCamera,
+    PerspectiveCamera,
+    Phong,
+    Shading,
+    TransferFunction,
+    raycast,
+    render,
+)
+from filterlab.scenes.build import PreparedSurface, build, load_scene, render_scene
+from filterlab.scenes.model import SurfaceModel, find_volume
+from filterlab.surfaces import LevelSet
 
 SCENES = Path(__file__).resolve().parent.parent / "configs" / "scenes"
 
@@ -214,3 +224,72 @@ def test_example_scenes_render_and_survive_a_round_trip(path, scene_file, tmp_pa
 
 def test_there_are_example_scenes():
     assert {p.stem for p in SCENES.glob("*.yaml")} >= {"engine", "marschner_lobb", "head_mri"}
+
+
+# --- surfaces ---------------------------------------------------------------------------------------------------------
+
+SURFACE = """
+signal: {name: marschner-lobb, samples: 12}
+surface: {level: 0.5, material: {color: [0.9, 0.5, 0.2], opacity: 0.5}, sheets: 2}
+camera: {direction: [1, 2, -1]}
+lighting: {lights: [{direction: [1, 0, 2]}]}
+size: [9, 7]
+"""
+
+
+def test_a_surface_is_what_its_parts_cast(scene_file):
+    image = render_scene(load_scene(scene_file(SURFACE)))
+    field = reconstruct(signals.marschner_lobb().sample(12, dtype=torch.float32), "triquadratic")
+    camera = PerspectiveCamera.framing(field.domain, (1.0, 2.0, -1.0), aspect=9 / 7)
+    material = Phong((0.9, 0.5, 0.2), opacity=0.5)
+    expected = raycast(LevelSet(field, 0.5), camera, material, size=(9, 7), lights=[Light((1.0, 0.0, 2.0))], sheets=2)
+    assert isinstance(expected, torch.Tensor)
+    assert torch.equal(image, expected[..., :3])
+    assert image.std() > 0.05
+
+
+def test_a_level_may_be_a_part_of_the_range(scene_file):
+    scenes = [load_scene(scene_file(SURFACE), {"surface": s}) for s in ("{level: 0.25, axis: normalized}", "0.1")]
+    samples = signals.marschner_lobb().sample(12, dtype=torch.float32).samples
+    low, high = samples.aminmax()
+    prepared = build(scenes[0])
+    assert isinstance(prepared, PreparedSurface)
+    assert prepared.surface.level == pytest.approx(float(low + 0.25 * (high - low)), rel=1e-6)
+    assert scenes[1].surface == SurfaceModel(level=0.1)
+
+
+@pytest.mark.parametrize("material", ["phong", "toon", "reflection_lines", "environment", "{kind: toon, contour: 0.1}"])
+def test_every_material_can_be_named(material, scene_file):
+    scene = load_scene(scene_file(SURFACE), {"surface": f"{{level: 0.5, material: {material}, shadows: true}}"})
+    assert render_scene(scene).isfinite().all()
+    assert load_scene(scene_file(dump_config(scene))) == scene
+
+
+def test_an_environment_may_be_a_picture(scene_file, tmp_path):
+    save_image(torch.full((4, 8, 3), 0.5), tmp_path / "around.png")
+    mirror = f"{{level: 0.5, material: {{kind: environment, picture: {tmp_path / 'around.png'}, reflectivity: 1}}}}"
+    image = render_scene(load_scene(scene_file(SURFACE), {"surface": mirror}))
+    hit = image.amax(-1) > 0
+    assert 10 < hit.sum() < 63
+    torch.testing.assert_close(image[hit], torch.full_like(image[hit], 0.5), rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"transfer": "{peaks: [{center: 1, width: 1, height: 0.5, color: [1, 1, 1]}]}"}, "got both"),
+        ({"surface": "null"}, "either a transfer function .* or a surface; got neither"),
+        ({"step": "0.5"}, "step: a surface is hit exactly"),
+        ({"termination": "0.5"}, "termination: a surface is hit exactly"),
+        ({"signal.samples": "null"}, "no exact pieces"),
+        ({"surface.material": "gold"}, "known names: phong, toon, reflection_lines, environment"),
+        ({"surface.material.colour": "[1, 1, 1]"}, "did you mean 'color'"),
+        ({"surface.material.opacity": "2"}, "opacity"),
+        ({"surface.level": "high"}, "surface.level: expected a valid number"),
+        ({"surface.sheets": "0"}, "surface.sheets"),
+        ({"surface": "{level: 0.5, material: {kind: environment, picture: no.png}}"}, "found none at .*no.png"),
+    ],
+)
+def test_mistakes_of_surfaces_are_named(change, message, scene_file):
+    with pytest.raises((ConfigError, ValueError), match=message):
+        render_scene(load_scene(scene_file(SURFACE), change))

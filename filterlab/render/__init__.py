@@ -1,16 +1,24 @@
-"""Direct volume rendering: cameras, rays, transfer functions, shading and the marcher over any Field."""
+"""Pictures: direct volume rendering of any Field, and ray casting of surfaces; cameras, lights, materials."""
 
 from filterlab.render.camera import Camera, OrthographicCamera, PerspectiveCamera
 from filterlab.render.dvr import render
+from filterlab.render.materials import Environment, Material, Phong, ReflectionLines, Toon
+from filterlab.render.raycast import raycast
 from filterlab.render.shading import Light, Shading
 from filterlab.render.transfer import TransferFunction
 
 __all__ = [
     "Camera",
+    "Environment",
     "Light",
+    "Material",
     "OrthographicCamera",
     "PerspectiveCamera",
+    "Phong",
+    "ReflectionLines",
     "Shading",
+    "Toon",
     "TransferFunction",
+    "raycast",
     "render",
 ]

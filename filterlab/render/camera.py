@@ -71,16 +71,22 @@ class Camera(ABC):
         origins, directions = self.pixel_rays(pixels, width, height)
         return origins.reshape(height, width, 3), directions.reshape(height, width, 3)
 
-    def pixel_rays(self, pixels: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-        """Origins and unit directions `(R, 3)` through the centres of `pixels` `(R,)`, numbered row by row from 0.
+    def pixel_rays(
+        self, pixels: Tensor, width: int, height: int, place: tuple[Tensor | float, Tensor | float] = (0.5, 0.5)
+    ) -> tuple[Tensor, Tensor]:
+        """Origins and unit directions `(R, 3)` through `pixels` `(R,)`, numbered row by row from 0.
 
         A ray depends on nothing but its own pixel, so that an image may be cut into tiles at will.
+
+        Args:
+            place: within each pixel, from left and top, in 0 … 1; the centre.
         """
+        across, down = place
         left, top, right, bottom = self.window
         number = pixels.double()  # whole numbers are exact, and divided ten times as fast as integers
         row = ((number + 0.5) / width).floor()
-        u = left + (number - row * width + 0.5) * ((right - left) / width)
-        v = top + (row + 0.5) * ((bottom - top) / height)
+        u = left + (number - row * width + across) * ((right - left) / width)
+        v = top + (row + down) * ((bottom - top) / height)
         aspect = (width * (bottom - top)) / (height * (right - left))
         return self._rays((2 * u - 1) * aspect, 1 - 2 * v)
 

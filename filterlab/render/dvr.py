@@ -24,6 +24,7 @@ from filterlab.ops.reference.march import rays_at_once
 from filterlab.render.camera import Camera
 from filterlab.render.fused import FusedMarcher, why_not_fused
 from filterlab.render.image import (
+    CENTER,
     Canvas,
     PixelRays,
     Progress,
@@ -282,7 +283,7 @@ class Cut:
 
     def inside(self, seen: PixelRays, pixels: Tensor) -> Spans:
         """The parts of the rays that lie in the domain."""
-        return spans(*seen.rays(pixels), self.domain, self.region)
+        return spans(*seen.rays(pixels, CENTER), self.domain, self.region)
 
     def offset(self, pixels: Tensor) -> Tensor:
         """How far into a step the first segment reaches, `(R,)`, in (0, 1]."""

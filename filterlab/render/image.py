@@ -25,6 +25,9 @@ from filterlab.render.tiles import tiled_part
 RayTensors = tuple[Tensor, Tensor]
 """Origins and directions, (..., 3) each."""
 
+Place = tuple[Tensor | float, Tensor | float]
+CENTER = (0.5, 0.5)
+
 Progress = bool | None | Callable[[int, int], None]
 """True: a progress bar on stderr; None: only if that is a terminal; or a function (done, total)."""
 
@@ -69,13 +72,13 @@ class PixelRays:
     Attributes:
         shape: of the image.
         pixels: the numbers of those that stand at some places in the order in which they are rendered.
-        rays: the rays of some pixels.
+        rays: the rays of some pixels, through a place within each (of a camera's image).
         requires_grad: whether derivatives by the rays are asked.
     """
 
     shape: tuple[int, ...]
     pixels: Callable[[range], Tensor]
-    rays: Callable[[Tensor], RayTensors]
+    rays: Callable[[Tensor, Place], RayTensors]
     requires_grad: bool
 
     @property
@@ -95,7 +98,11 @@ class PixelRays:
                 raise ValueError("size=(width, height) is needed with a camera")
             width, height = check_size(size)
             pixels = _tile_by_tile(height, width, device)
-            return cls((height, width), pixels, lambda p: camera.pixel_rays(p, width, height), camera.requires_grad)
+
+            def rays(numbers: Tensor, place: Place) -> RayTensors:
+                return camera.pixel_rays(numbers, width, height, place)
+
+            return cls((height, width), pixels, rays, camera.requires_grad)
         if size is not None:
             raise ValueError(f"size goes with a camera; rays bring their own shape; got size={size!r}")
         origins, directions = camera
@@ -103,7 +110,7 @@ class PixelRays:
         requires_grad = o.requires_grad or d.requires_grad
         shape = tuple(origins.shape[:-1])
         pixels = _tile_by_tile(*shape, device) if len(shape) == 2 else _one_by_one(device)
-        return cls(shape, pixels, lambda p: (o[p], d[p]), requires_grad)
+        return cls(shape, pixels, lambda p, _: (o[p], d[p]), requires_grad)
 
 
 def _tile_by_tile(height: int, width: int, device: torch.device) -> Callable[[range], Tensor]:
@@ -142,11 +149,13 @@ class Canvas:
         seen: the pixels.
         channels: (N, C) of a batch of images; None: one image.
         differentiable: whether autograd records the parts.
+        width: numbers of a pixel.
     """
 
     seen: PixelRays
     channels: tuple[int, int] | None
     differentiable: bool
+    width: int = 4
 
     @property
     def images(self) -> int:
@@ -154,20 +163,20 @@ class Canvas:
         return math.prod(self.channels or ())
 
     def filled(self, parts: Iterable[tuple[int, range, Tensor]], like: Tensor) -> Tensor:
-        """`(*channels, *shape, 4)` of (number of the image, places in the order of rendering, their pixels (R, 4)).
+        """`(*channels, *shape, width)` of (number of the image, places in the order of rendering, pixels (R, width)).
 
         Without derivatives every part is written where it belongs, and nothing is copied.
         """
         fill = self._joined if self.differentiable else self._written
-        return fill(parts, like).reshape(*(self.channels or ()), *self.seen.shape, 4)
+        return fill(parts, like).reshape(*(self.channels or ()), *self.seen.shape, self.width)
 
     def _joined(self, parts: Iterable[tuple[int, range, Tensor]], like: Tensor) -> Tensor:
-        joined = torch.cat([part for _, _, part in parts] or [like.new_zeros(0, 4)])
-        joined = joined.reshape(self.images, self.seen.count, 4)
+        joined = torch.cat([part for _, _, part in parts] or [like.new_zeros(0, self.width)])
+        joined = joined.reshape(self.images, self.seen.count, self.width)
         return torch.empty_like(joined).index_copy(1, self.seen.pixels(range(self.seen.count)), joined)
 
     def _written(self, parts: Iterable[tuple[int, range, Tensor]], like: Tensor) -> Tensor:
-        images = like.new_empty(self.images, self.seen.count, 4)
+        images = like.new_empty(self.images, self.seen.count, self.width)
         for number, order, part in parts:
             images[number].index_copy_(0, self.seen.pixels(order), part)
         return images

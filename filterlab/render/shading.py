@@ -113,19 +113,26 @@ class Shading:
             "specular · light": _plain(self.specular) * total,
         }
 
-    def __call__(self, color: Tensor, gradient: Tensor, direction: Tensor) -> Tensor:
-        """Lit colours `(..., 3)`, of colours `(..., 3)`, gradients `(..., 3)` and unit ray directions `(..., 3)`."""
+    def __call__(
+        self, color: Tensor, gradient: Tensor, direction: Tensor, shadows: Sequence[Tensor | None] = ()
+    ) -> Tensor:
+        """Lit colours `(..., 3)`, of colours `(..., 3)`, gradients `(..., 3)` and unit ray directions `(..., 3)`.
+
+        Args:
+            shadows: how much of each light arrives, `(...)` in 0 … 1; None: all of it.
+        """
         normal, view = safe_normalize(gradient), -direction
-        matt, shine = self._sums(normal, view)
+        matt, shine = self._sums(normal, view, shadows or [None] * len(self.lights))
         ambient, diffuse, specular = (_like(x, color) for x in (self.ambient, self.diffuse, self.specular))
         return color * (ambient + diffuse * matt) + specular * shine
 
-    def _sums(self, normal: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+    def _sums(self, normal: Tensor, view: Tensor, shadows: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
         """Σ I |n·l| and Σ I |n·h|^shininess, `(..., 3)` each."""
         matt, shine = torch.zeros((), dtype=view.dtype, device=view.device), torch.zeros_like(normal[..., :1])
         shininess = _like(self.shininess, view)
-        for light in self.lights:
+        for light, arriving in zip(self.lights, shadows, strict=True):
             tint = _like(light.color, view)
+            tint = tint if arriving is None else tint * arriving[..., None]
             if light.direction is None:
                 facing = half = dot(normal, view).abs()
             else:

@@ -7,35 +7,39 @@ image = render_scene(scene)
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from filterlab.fields.base import Field
-from filterlab.io.config import load_config
+from filterlab.io.config import dump_data, load_config, loads_config
 from filterlab.recommendation import recommend, report
 from filterlab.render.camera import Camera
 from filterlab.render.dvr import Frame, prepare
 from filterlab.render.image import Progress
+from filterlab.render.materials import Material
+from filterlab.render.raycast import raycast
 from filterlab.render.rays import Region
 from filterlab.render.sampling import Sampling
-from filterlab.render.shading import Shading
+from filterlab.render.shading import Light, Shading
 from filterlab.render.transfer import TransferFunction
-from filterlab.scenes.model import Scene, SceneMethod, Vector
+from filterlab.scenes.model import Lighting, Scene, SceneMethod, SurfaceModel, Vector
+from filterlab.surfaces.level_set import LevelSet
 from filterlab.volume import Volume
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """A scene with everything built: what `render` takes.
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """A scene with everything built that media and surfaces have in common.
 
     Attributes:
         scene: with `method: auto` replaced by what was found.
         size: (width, height) in pixels.
-        sampling: how the picture is sampled.
         volume_bytes: of the samples; 0 for a signal that is not sampled.
         chosen: how `method: auto` came to its choice, in sentences; else nothing.
     """
@@ -43,15 +47,25 @@ class Prepared:
     scene: Scene
     field: Field
     camera: Camera
-    transfer: TransferFunction
     size: tuple[int, int]
-    shading: Shading | None
     background: Vector
     region: Region | None
-    sampling: Sampling
     device: str
     volume_bytes: int = 0
     chosen: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepared(Shown):
+    """A medium: what `render` takes.
+
+    Attributes:
+        sampling: how the picture is sampled.
+    """
+
+    transfer: TransferFunction
+    shading: Shading | None
+    sampling: Sampling
 
     def frame(self) -> Frame:
         """The image, ready to be marched."""
@@ -72,6 +86,38 @@ class Prepared:
         return self.frame().run(progress)
 
 
+@dataclass(frozen=True, kw_only=True)
+class PreparedSurface(Shown):
+    """A surface: what `raycast` takes."""
+
+    surface: LevelSet
+    material: Material
+    lights: tuple[Light, ...]
+
+    def render(self, progress: Progress = False) -> Tensor:
+        """The image `(H, W, 4)`, as `filterlab.render.raycast.raycast` gives it."""
+        asked = self.scene.surface
+        assert asked is not None
+        image = raycast(
+            self.surface,
+            self.camera,
+            self.material,
+            size=self.size,
+            lights=self.lights,
+            background=self.background,
+            region=self.region,
+            sheets=asked.sheets,
+            shadows=asked.shadows,
+            subpixels=asked.subpixels,
+            seed=self.scene.jitter or 0,
+            dtype=self.scene.dtype,
+            device=self.device,
+            progress=progress,
+        )
+        assert isinstance(image, Tensor)
+        return image
+
+
 def load_scene(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Scene:
     """The scene in a YAML file, with some of its keys set anew ({"camera.window": "[0, 0, 0.5, 0.5]"}).
 
@@ -82,8 +128,37 @@ def load_scene(path: str | os.PathLike[str], overrides: Mapping[str, str] | None
     return load_config(path, Scene, overrides)
 
 
-def build(scene: Scene) -> Prepared:
-    """Loads or samples what the scene shows, reconstructs it and builds camera, transfer function and lights.
+def surface_scene(volume: str | os.PathLike[str], level: str, overrides: Mapping[str, str] | None = None) -> Scene:
+    """The scene of a surface in a volume file with everything else left out: seen from the side, softly lit.
+
+    Args:
+        level: a number as text.
+        overrides: as for `load_scene`.
+
+    Raises:
+        ConfigError: as `load_scene`.
+    """
+    content = {"volume": str(volume), "surface": {"level": _number(level), "subpixels": 2}, **_SURFACE}
+    return loads_config(dump_data(content), Scene, overrides, name="--level")
+
+
+_SURFACE: Mapping[str, Any] = {
+    "camera": {"direction": [-0.6, 0.75, -0.5], "window": [0.12, 0.12, 0.88, 0.88]},
+    "lighting": {"lights": [{"direction": [0.5, -0.6, 0.8], "color": [0.9, 0.88, 0.85]}, {"color": [0.3, 0.32, 0.36]}]},
+    "background": [0.02, 0.022, 0.03],
+}
+
+
+def _number(text: str) -> float | str:
+    """The number, or the text where it is none, for the model to refuse."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def build(scene: Scene) -> Prepared | PreparedSurface:
+    """Loads or samples what the scene shows, reconstructs it and builds camera, lights and what they fall on.
 
     Raises ValueError where `method: auto` finds nothing within its budget, with the best there is.
     """
@@ -96,21 +171,38 @@ def build(scene: Scene) -> Prepared:
     else:
         field = (scene.method or SceneMethod()).build(volume)
         value_range = partial(_range, volume.samples)
-    transfer = scene.transfer.build(value_range, field.domain.voxel_size)
-    camera = scene.camera.build(field.domain, scene.size)
+    shown: dict[str, Any] = {
+        "scene": scene,
+        "field": field,
+        "camera": scene.camera.build(field.domain, scene.size),
+        "size": scene.size,
+        "background": scene.background,
+        "region": scene.region.build() if scene.region else None,
+        "device": scene.device,
+        "volume_bytes": 0 if volume is None else volume.samples.nbytes,
+        "chosen": chosen,
+    }
+    if scene.surface is not None:
+        return _surface(scene.surface, shown, value_range)
+    assert scene.transfer is not None
     return Prepared(
-        scene=scene,
-        field=field,
-        camera=camera,
-        transfer=transfer,
-        size=scene.size,
+        **shown,
+        transfer=scene.transfer.build(value_range, field.domain.voxel_size),
         shading=scene.lighting.build() if scene.lighting else None,
-        background=scene.background,
-        region=scene.region.build() if scene.region else None,
         sampling=Sampling(scene.step_or_default, scene.jitter, scene.termination, scene.dtype),
-        device=scene.device,
-        volume_bytes=0 if volume is None else volume.samples.nbytes,
-        chosen=chosen,
+    )
+
+
+def _surface(
+    asked: SurfaceModel, shown: dict[str, Any], value_range: Callable[[], tuple[float, float]]
+) -> PreparedSurface:
+    scene, field = shown["scene"], shown["field"]
+    lighting = scene.lighting or Lighting()
+    return PreparedSurface(
+        **shown,
+        surface=LevelSet(field, asked.at(value_range)),
+        material=asked.material.build(Path()),
+        lights=tuple(lighting.build().lights),
     )
 
 

@@ -23,9 +23,11 @@ from filterlab.fields.base import Field as FilterlabField
 from filterlab.fields.storage import StorageName
 from filterlab.io.bounded import VolumeFileError
 from filterlab.io.config import StrictModel, unknown_name
+from filterlab.io.images import load_image
 from filterlab.io.volumes import VolumeHeader, describe, load_volume
 from filterlab.methods import METHODS, Method, reconstruct, scheme_named
 from filterlab.missing_values import NanChoice
+from filterlab.render import materials
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
 from filterlab.render.rays import check_region
 from filterlab.render.shading import Light, Shading
@@ -83,8 +85,17 @@ def _named(value: Any) -> Any:
     return {"name": value} if isinstance(value, str) else value
 
 
+def _of_kind(value: Any) -> Any:
+    """A bare name stands for the section of that kind and every default; without a kind it is phong."""
+    if isinstance(value, str):
+        return {"kind": value}
+    return {"kind": "phong", **value} if isinstance(value, Mapping) else value
+
+
 # a section that a bare name may stand for is validated as Python data, where a strict tuple would be no list
 _Listed = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
+_ListedColor = Annotated[Color, _Listed]
+_ListedVector = Annotated[Vector, _Listed]
 Parameters = dict[str, float | Annotated[tuple[float, ...], _Listed]]
 
 
@@ -465,19 +476,133 @@ class Region(StrictModel):
         return self.lower, self.upper
 
 
+# --- surfaces ---------------------------------------------------------------------------------------------------------
+
+
+class PhongModel(StrictModel):
+    """Blinn-Phong; see `filterlab.render.materials.Phong`."""
+
+    kind: Literal["phong"] = "phong"
+    color: _ListedColor = (0.85, 0.72, 0.55)
+    ambient: Component = 0.2
+    diffuse: Component = 0.7
+    specular: Component = 0.3
+    shininess: Annotated[float, Field(ge=1)] = 32.0
+    opacity: Opacity = 1.0
+
+    def build(self, folder: Path) -> materials.Material:
+        """The material."""
+        weights = (self.ambient, self.diffuse, self.specular, self.shininess)
+        return materials.Phong(self.color, *weights, opacity=self.opacity)
+
+
+class ToonModel(StrictModel):
+    """Bands of light and contours; see `filterlab.render.materials.Toon`. `contour` is a world length."""
+
+    kind: Literal["toon"]
+    color: _ListedColor = (0.9, 0.75, 0.5)
+    bands: Annotated[int, Field(ge=1)] = 3
+    ambient: Annotated[float, Field(ge=0, le=1)] = 0.3
+    contour: Component = 0.0
+    ink: _ListedColor = (0.02, 0.02, 0.05)
+    opacity: Opacity = 1.0
+
+    def build(self, folder: Path) -> materials.Material:
+        """The material."""
+        return materials.Toon(self.color, self.bands, self.ambient, self.contour, self.ink, self.opacity)
+
+
+class ReflectionLinesModel(StrictModel):
+    """Mirrored stripes of light; see `filterlab.render.materials.ReflectionLines`."""
+
+    kind: Literal["reflection_lines"]
+    axis: _ListedVector = (0.0, 0.0, 1.0)
+    count: Positive = 8.0
+    sharpness: Positive = 8.0
+    bright: _ListedColor = (0.95, 0.95, 0.95)
+    dark: _ListedColor = (0.05, 0.05, 0.1)
+    opacity: Opacity = 1.0
+
+    @model_validator(mode="after")
+    def _valid(self) -> Self:
+        self.build(Path())
+        return self
+
+    def build(self, folder: Path) -> materials.Material:
+        """The material."""
+        return materials.ReflectionLines(self.axis, self.count, self.sharpness, self.bright, self.dark, self.opacity)
+
+
+class EnvironmentModel(StrictModel):
+    """A mirror of what is around; see `filterlab.render.materials.Environment`.
+
+    Attributes:
+        picture: an equirectangular image file, looked for like a volume; left out, a clear sky.
+    """
+
+    kind: Literal["environment"]
+    picture: Annotated[str, Field(min_length=1)] | None = None
+    color: _ListedColor = (0.2, 0.2, 0.22)
+    reflectivity: Annotated[float, Field(ge=0, le=1)] = 0.4
+    opacity: Opacity = 1.0
+
+    def build(self, folder: Path) -> materials.Material:
+        """The material. Raises ValueError for a picture that is not there or can't be read."""
+        picture = None if self.picture is None else load_image(find_volume(self.picture, folder))
+        return materials.Environment(picture, self.color, self.reflectivity, self.opacity)
+
+
+MaterialModel = Annotated[PhongModel | ToonModel | ReflectionLinesModel | EnvironmentModel, Field(discriminator="kind")]
+
+
+class SurfaceModel(StrictModel):
+    """The level set of a scene's field, hit exactly; a bare number stands for its level.
+
+    Attributes:
+        level: the value on the surface.
+        axis: `raw`: a value of the volume; `normalized`: 0 … 1 stand for its smallest and largest sample.
+        material: what it is made of; a bare name stands for its kind.
+        sheets: how many hits of a ray are shown through each other, where the material is transparent.
+        shadows: whether lights with a direction cast any.
+        subpixels: s: a pixel is the mean of s² rays.
+    """
+
+    level: float
+    axis: Literal["raw", "normalized"] = "raw"
+    material: Annotated[MaterialModel, BeforeValidator(_of_kind)] = PhongModel()
+    sheets: Annotated[int, Field(ge=1, le=64)] = 1
+    shadows: bool = False
+    subpixels: Annotated[int, Field(ge=1, le=8)] = 1
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_level(cls, value: Any) -> Any:
+        return {"level": value} if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+    def at(self, value_range: Callable[[], tuple[float, float]]) -> float:
+        """The level as a value of the field. `value_range` is asked where the axis is normalized."""
+        if self.axis == "raw":
+            return self.level
+        low, high = value_range()
+        return low + self.level * (high - low)
+
+
 class Scene(StrictModel):
-    """A picture of a volume or a signal.
+    """A picture of a volume or a signal: of a medium, or of a surface in it.
 
     Attributes:
         description: for people.
         volume, signal: what is shown; exactly one of them.
         method: how samples are reconstructed; default triquadratic.
-        transfer, camera, lighting, region: see there; without lighting colours are shown as they are.
+        transfer: of a medium: what its values look like.
+        surface: instead of it: the level set that is shown.
+        camera, region: see there.
+        lighting: without it a medium's colours are shown as they are, and a surface has a headlight; of a surface it is
+            the lights alone, and the material has the weights.
         size: (width, height) in pixels.
-        step: in voxels; default half a voxel, or what `method: auto` finds.
+        step: of a medium, in voxels; default half a voxel, or what `method: auto` finds.
         background: linear RGB.
-        jitter: a seed; see `render`.
-        termination: see `render`.
+        jitter, termination: of a medium; see `render`. A surface takes jitter as the seed of its subpixels.
         precision: of samples and arithmetic.
         device: where to compute, as torch names it.
     """
@@ -486,7 +611,8 @@ class Scene(StrictModel):
     volume: VolumeFile | None = None
     signal: SignalSource | None = None
     method: SceneMethod | None = None
-    transfer: Transfer
+    transfer: Transfer | None = None
+    surface: SurfaceModel | None = None
     camera: CameraView = CameraView()
     size: tuple[Pixels, Pixels] = (512, 512)
     step: Positive | None = None
@@ -511,9 +637,21 @@ class Scene(StrictModel):
             raise ValueError("expected either a volume or a signal" + ("; got both" if self.volume else ""))
         if self.signal is not None and self.signal.samples is None and self.method is not None:
             raise ValueError("a signal that is not sampled needs no method: give signal.samples, or leave method out")
-        if self.transfer.axis == "raw":  # else the values are known with the volume
+        if (self.transfer is None) == (self.surface is None):
+            both = "; got both" if self.transfer else "; got neither"
+            raise ValueError(f"expected either a transfer function (a medium) or a surface{both}")
+        if self.surface is not None:
+            self._check_surface()
+        elif self.transfer is not None and self.transfer.axis == "raw":  # else the values are known with the volume
             self.transfer.build(lambda: (0.0, 1.0), 1.0).to(self.dtype)
         return self
+
+    def _check_surface(self) -> None:
+        stepped = [name for name in ("step", "termination") if getattr(self, name) is not None]
+        if stepped:
+            raise ValueError(f"{' and '.join(stepped)}: a surface is hit exactly, not stepped to; leave it out")
+        if self.signal is not None and self.signal.samples is None:
+            raise ValueError("a surface is that of samples: give signal.samples, a signal itself has no exact pieces")
 
     @property
     def dtype(self) -> torch.dtype:

@@ -8,12 +8,13 @@ scene ──▶ Prepared ──▶ Frame (dvr.prepare) ──▶ rays, segments,
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
 
 from filterlab.costs import Quartiles, coefficient_bytes
+from filterlab.fields.base import Field
 from filterlab.fields.grid import GridField
 from filterlab.methods import METHODS
 from filterlab.ops.march import Chords
@@ -21,7 +22,7 @@ from filterlab.ops.reference.march import segments
 from filterlab.render.dvr import Frame
 from filterlab.render.fused import FusedMarcher, empty_bricks, why_not_fused
 from filterlab.render.plain import Medium
-from filterlab.scenes.build import Prepared
+from filterlab.scenes.build import Prepared, PreparedSurface
 from filterlab.scenes.model import Scene
 
 _PROBE_RAYS = 4096
@@ -80,22 +81,110 @@ class Plan:
         return asdict(self)
 
 
-def plan(prepared: Prepared) -> Plan:
-    """The plan of a scene that is built; some of its rays are marched, the picture is not.
+@dataclass(frozen=True)
+class SurfacePlan:
+    """What casting rays at the surface of a scene takes.
+
+    Attributes:
+        method, scheme, storage, taps: as in `Plan`.
+        level: the value on the surface.
+        degree: of the field's pieces along a ray.
+        cells, pieces: how many of the volume may hold the level; no others are looked into.
+        order: derivatives of the surface that its material needs: 1 normals, 2 curvatures.
+        rays: of the whole image, without those to lights.
+        volume_bytes, coefficient_bytes, image_bytes: memory.
+        seconds: from the median and the quartiles of a few runs of some rays.
+        absent, chosen: as in `Plan`.
+    """
+
+    method: str
+    scheme: str
+    storage: str
+    taps: int | None
+    level: float
+    degree: int
+    cells: int
+    pieces: int
+    order: int
+    rays: int
+    volume_bytes: int
+    coefficient_bytes: int
+    image_bytes: int
+    seconds: Quartiles
+    absent: tuple[str, ...]
+    chosen: tuple[str, ...] = ()
+
+    def data(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+
+def plan(prepared: Prepared | PreparedSurface) -> Plan | SurfacePlan:
+    """The plan of a scene that is built; some of its rays are followed, the picture is not made.
 
     Takes as long as a few thousand rays do, five times over.
     """
+    return _plan_of_surface(prepared) if isinstance(prepared, PreparedSurface) else _plan_of_medium(prepared)
+
+
+def _plan_of_surface(prepared: PreparedSurface) -> SurfacePlan:
+    field, scene = prepared.field, prepared.scene
+    assert scene.surface is not None
+    relevant, (width, height) = prepared.surface.relevant(), prepared.size
+    rays = width * height * scene.surface.subpixels**2
+    return SurfacePlan(
+        **_described(field),
+        level=float(prepared.surface.level),
+        degree=field.degree_along_rays or 0,
+        cells=relevant.cells,
+        pieces=relevant.pieces,
+        order=prepared.material.order,
+        rays=rays,
+        volume_bytes=prepared.volume_bytes,
+        coefficient_bytes=coefficient_bytes(field),
+        image_bytes=width * height * 4 * scene.dtype.itemsize,
+        seconds=_seconds_of_surface(prepared, rays),
+        absent=_absent_of_surface(scene),
+        chosen=prepared.chosen,
+    )
+
+
+def _seconds_of_surface(prepared: PreparedSurface, rays: int) -> Quartiles:
+    """Of all rays, from a smaller picture of the same view."""
+    width, height = prepared.size
+    scale = min(1.0, (_PROBE_RAYS / (width * height)) ** 0.5)
+    small = max(round(width * scale), 1), max(round(height * scale), 1)
+    scene = prepared.scene.model_copy(
+        update={"surface": prepared.scene.surface.model_copy(update={"subpixels": 1})}  # type: ignore[union-attr]
+    )
+    probe, taken = replace(prepared, size=small, scene=scene), []
+    for _ in range(_REPEATS + 1):
+        start = time.perf_counter()
+        with torch.no_grad():
+            probe.render().sum().item()
+        taken.append((time.perf_counter() - start) * rays / (small[0] * small[1]))
+    return Quartiles.of(taken[1:])
+
+
+def _described(field: Field) -> dict[str, Any]:
+    """Method, scheme, storage and taps of a field."""
+    known = isinstance(field, GridField)
+    return {
+        "method": field.method if known else "exact",
+        "scheme": field.scheme.name,
+        "storage": str(field.coefficients.values.dtype).removeprefix("torch.") if known else "–",
+        "taps": METHODS[field.method].facts.taps if known and field.method in METHODS else None,
+    }
+
+
+def _plan_of_medium(prepared: Prepared) -> Plan:
     frame = prepared.frame()
     medium, some = frame.media[0], _some_rays(frame)
     seconds = _seconds(frame, medium, some)
     empty, skipped = _skipped(frame, medium, some)
     field = prepared.field
-    known = isinstance(field, GridField)
     return Plan(
-        method=field.method if known else "exact",
-        scheme=field.scheme.name,
-        storage=str(field.coefficients.values.dtype).removeprefix("torch.") if known else "–",
-        taps=METHODS[field.method].facts.taps if known and field.method in METHODS else None,
+        **_described(field),
         order=medium.order,
         marcher="fused" if isinstance(frame.marcher, FusedMarcher) else "plain",
         not_fused=why_not_fused(medium),
@@ -152,6 +241,22 @@ def _skipped(frame: Frame, medium: Medium, some: Chords) -> tuple[float | None, 
         inside += int(found.empty(points[real]).sum())
         total += int(real.sum())
     return float(empty.double().mean()), inside / max(total, 1)
+
+
+def _absent_of_surface(scene: Scene) -> tuple[str, ...]:
+    """What is not computed of a surface, because the scene does not ask for it."""
+    asked = scene.surface
+    assert asked is not None
+    parts = []
+    if asked.sheets == 1:
+        parts.append("sheets behind the first")
+    if not asked.shadows:
+        parts.append("shadows")
+    if scene.region is None:
+        parts.append("region: rays are cut to the volume only")
+    if asked.subpixels == 1:
+        parts.append("subpixels: one ray for each pixel")
+    return tuple(parts)
 
 
 def _absent(scene: Scene) -> tuple[str, ...]:

@@ -2,25 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rich.table import Table
 from rich.text import Text
 
 from filterlab.recommendation.report import duration, percent, size
-from filterlab.scenes.plan import Plan
+from filterlab.scenes.plan import Plan, SurfacePlan
 
 
-def table(plan: Plan) -> Table:
+def table(plan: Plan | SurfacePlan) -> Table:
     """One line for every decision."""
     shown = Table(show_header=False, box=None)
-    for name, text in _lines(plan):
+    for name, text in _lines_of_surface(plan) if isinstance(plan, SurfacePlan) else _lines(plan):
         shown.add_row(name, Text(text))
     return shown
 
 
-def _lines(plan: Plan) -> list[tuple[str, str]]:
+def _begin(plan: Plan | SurfacePlan) -> list[tuple[str, str]]:
     taps = "" if plan.taps is None else f", {plan.taps} taps"
     lines = [("method", f"{plan.method} ({plan.scheme}), coefficients as {plan.storage}{taps}")]
-    lines += [("" if i else "chosen", sentence) for i, sentence in enumerate(plan.chosen)]
+    return lines + [("" if i else "chosen", sentence) for i, sentence in enumerate(plan.chosen)]
+
+
+def _lines_of_surface(plan: SurfacePlan) -> list[tuple[str, str]]:
+    lines = _begin(plan)
+    asked = {1: "gradients", 2: "gradients and Hessians"}[plan.order]
+    lines.append(("surface", f"level {plan.level:g}; pieces of degree {plan.degree} along rays, {asked} at hits"))
+    lines.append(("relevant", f"{plan.cells:,} cells may hold the level ({plan.pieces:,} pieces)"))
+    lines.append(("rays", f"{plan.rays:,}"))
+    sizes = (("volume", plan.volume_bytes), ("coefficients", plan.coefficient_bytes), ("image", plan.image_bytes))
+    return lines + _end(plan, sizes, "cast")
+
+
+def _lines(plan: Plan) -> list[tuple[str, str]]:
+    lines = _begin(plan)
     lines.append(("asked of it", plan.derivatives))
     marcher = "fused: one program, compiled for this processor" if plan.marcher == "fused" else "plain: torch"
     lines.append(("marcher", marcher + (f" ({plan.not_fused})" if plan.not_fused else "")))
@@ -33,10 +49,14 @@ def _lines(plan: Plan) -> list[tuple[str, str]]:
         ("image", plan.image_bytes),
         ("rays", plan.ray_bytes),
     )
-    lines.append(("memory", ", ".join(f"{name} {size(count)}" for name, count in sizes if count)))
+    return lines + _end(plan, sizes, "march")
+
+
+def _end(plan: Plan | SurfacePlan, sizes: Sequence[tuple[str, int]], verb: str) -> list[tuple[str, str]]:
+    lines = [("memory", ", ".join(f"{name} {size(count)}" for name, count in sizes if count))]
     time = plan.seconds
     spread = f"{duration(time.low)} … {duration(time.high)}"
-    lines.append(("time", f"about {duration(time.median)} to march ({spread}, from a small part of the rays)"))
+    lines.append(("time", f"about {duration(time.median)} to {verb} ({spread}, from a small part of the rays)"))
     lines += [("" if i else "not computed", text) for i, text in enumerate(plan.absent)]
     return lines
 

@@ -1,0 +1,245 @@
+"""Ray casting of surfaces: hits, then what is known of the surface there, then materials; no stepping.
+
+    rays ─▶ spans in the domain ─▶ hits, one or k sheets ─▶ point, normal, curvature ─▶ material ─▶ over background
+
+Rays begin where they enter the domain (and the region): t is measured from near what is hit, not from the eye.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from filterlab.ops.reference.optics import dot
+from filterlab.render.camera import Camera
+from filterlab.render.image import (
+    CENTER,
+    Canvas,
+    PixelRays,
+    Place,
+    Progress,
+    RayTensors,
+    check_background,
+    check_camera,
+    device_of,
+    reporting,
+)
+from filterlab.render.materials import Material, Phong, Seen
+from filterlab.render.rays import Region, Spans, check_region, jitter, spans
+from filterlab.render.shading import Light
+from filterlab.surfaces.base import MAX_SHEETS, Hits, Surface, SurfacePoints
+
+_PART = 1 << 15  # rays at a time; what they meet is cut up further by the surface
+_LIFT = 1e-3  # voxels by which a ray to a light begins in front of the surface
+_MOST_SUBPIXELS = 64
+
+CHANNELS = {"color": 4, "depth": 1, "normal": 3, "position": 3, "sheets": 1}
+"""What can be asked of a pixel, and how many numbers it is."""
+
+_FRONTAL = (Light(),)
+
+
+@dataclass(frozen=True)
+class Casting:
+    """What is cast, and how; see `raycast`."""
+
+    surface: Surface
+    material: Material
+    lights: tuple[Light, ...]
+    background: Tensor
+    region: Region | None
+    sheets: int
+    shadows: bool
+    dtype: torch.dtype
+
+    def __call__(self, origins: Tensor, directions: Tensor, channels: Sequence[str]) -> Tensor:
+        """The channels of rays (R, 3), side by side (R, width)."""
+        inside = spans(origins, directions, self.surface.domain, self.region)
+        hits = self._hits(inside)
+        needed = self.material.order if "color" in channels else 1
+        at = self.surface.at(inside.entry.to(self.dtype), directions.to(self.dtype), hits, needed)
+        parts = {
+            "color": lambda: self._color(at, hits, directions),
+            "depth": lambda: _depth(origins, directions, at, hits),
+            "normal": lambda: _first(at.normal),
+            "position": lambda: _first(at.point),
+            "sheets": lambda: hits.valid.sum(-1, keepdim=True).to(self.dtype),
+        }
+        return torch.cat([parts[name]() for name in channels], -1)
+
+    def _hits(self, inside: Spans) -> Hits:
+        """Those within the spans: t (R, k) from where rays enter."""
+        entry, direction = (x.to(self.dtype) for x in (inside.entry, inside.direction))
+        if self.sheets == 1:
+            t = self.surface.hit(entry, direction).t[:, None]
+        else:
+            t = self.surface.hits(entry, direction, self.sheets).t
+        length = inside.length.detach().to(self.dtype)[:, None]
+        slack = 8 * torch.finfo(self.dtype).eps * self.surface.domain.diagonal
+        return Hits(torch.where((length > 0) & (t.detach() <= length + slack), t, torch.inf))
+
+    def _color(self, at: SurfacePoints, hits: Hits, directions: Tensor) -> Tensor:
+        """Sheets in front of each other, from the eye on, over the background: RGB and opacity (R, 4)."""
+        valid = hits.valid
+        seen = self._seen(at, valid, directions)
+        colors = at.point.new_zeros(at.point.shape).index_put((valid,), self.material(seen, self.lights))
+        rgb, passing = at.point.new_zeros(len(valid), 3), at.point.new_ones(len(valid), 1)
+        for k in range(self.sheets):
+            opacity = self.material.opacity * valid[:, k, None].to(rgb)
+            rgb, passing = rgb + passing * opacity * colors[:, k], passing * (1 - opacity)
+        return torch.cat((rgb + passing * self.background.to(rgb), 1 - passing), -1)
+
+    def _seen(self, at: SurfacePoints, valid: Tensor, directions: Tensor) -> Seen:
+        assert at.normal is not None
+        direction = directions.to(self.dtype)[:, None].expand_as(at.point)[valid]
+        point, normal = at.point[valid], at.normal[valid]
+        curved = (None, None) if at.curvatures is None else (at.curvatures[valid], at.principal[valid])  # type: ignore[index]
+        toward_eye = torch.where(dot(normal, direction)[:, None] > 0, -normal, normal).detach()
+        lifted = point.detach() + _LIFT * self.surface.domain.voxel_size * toward_eye
+
+        def visibility(light: Light) -> Tensor | None:
+            if not self.shadows or light.direction is None:  # a headlight shines wherever the eye sees
+                return None
+            toward = light.toward(point).detach().expand_as(point)
+            with torch.no_grad():
+                return (~self.surface.hit(lifted, toward).valid).to(point)
+
+        return Seen(point, normal, direction, *curved, visibility)
+
+
+def _first(rows: Tensor | None) -> Tensor:
+    assert rows is not None
+    return rows[:, 0]
+
+
+def _depth(origins: Tensor, directions: Tensor, at: SurfacePoints, hits: Hits) -> Tensor:
+    """(R, 1): world distances along unit rays, ∞ where nothing is hit."""
+    depth = dot(at.point[:, 0].double() - origins, directions)
+    return torch.where(hits.valid[:, 0], depth, torch.inf).to(at.point)[:, None]
+
+
+def raycast(
+    surface: Surface,
+    camera: Camera | RayTensors,
+    material: Material | None = None,
+    *,
+    size: Sequence[int] | None = None,
+    lights: Sequence[Light] = _FRONTAL,
+    background: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
+    region: Region | None = None,
+    sheets: int = 1,
+    shadows: bool = False,
+    subpixels: int = 1,
+    seed: int = 0,
+    channels: Sequence[str] | None = None,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str | None = None,
+    progress: Progress = False,
+) -> Tensor | dict[str, Tensor]:
+    """The image of a surface, hit exactly.
+
+    Args:
+        surface: a level set, or whatever else rays can hit.
+        camera: a Camera, or (origins, directions) `(..., 3)` world rays.
+        material: what turns hits into colour; default `Phong()`.
+        size: (width, height) of the image; only with a Camera.
+        lights: all of them; default a white headlight.
+        background: linear RGB behind the surface; may require grad.
+        region: a world-space box (lower, upper): what lies outside is cut away.
+        sheets: how many hits of a ray are composited, in exact order; 1 unless the material is transparent.
+        shadows: whether a second ray to every light that is no headlight asks what stands in between.
+        subpixels: s: every pixel is the mean of s² rays, one at a place drawn in each of s × s parts of it.
+        seed: of those places, which depend on it and the pixel's number alone.
+        channels: some of `CHANNELS`, each as a tensor of its own: `color`; `depth`, the world distance, ∞ where nothing
+            is hit; `normal` and `position`, of the first hit, 0 where none; `sheets`, how many were hit.
+        dtype: float32 or float64, of hits and image.
+        device: where to compute; default where the camera or the rays are.
+        progress: True shows a progress bar on stderr, None only if that is a terminal; or a function (done, total).
+
+    Returns:
+        `(H, W, 4)` (or `(..., 4)` for rays): linear RGB over the background, and opacity. With `channels` a dictionary
+        of `(H, W, n)`. Differentiable in whatever the surface, camera, lights, material and background depend on, but
+        not in where a silhouette is: a pixel's hit moves, it does not come or go.
+
+    Raises:
+        TypeError: no surface, camera or material. ValueError: numbers out of range, channels that are not known, more
+            than one ray a pixel for other channels than the colour.
+    """
+    _check(surface, material, sheets, subpixels, channels, dtype, camera)
+    check_camera(camera)
+    device = torch.device(device or device_of(camera) or "cpu")
+    seen = PixelRays.of(camera, size, device)
+    asked = ("color",) if channels is None else tuple(channels)
+    cast = Casting(
+        surface,
+        material or Phong(),
+        tuple(lights),
+        check_background(background, device),
+        None if region is None else check_region(region),
+        sheets,
+        shadows,
+        dtype,
+    )
+    canvas = Canvas(seen, None, torch.is_grad_enabled(), sum(CHANNELS[name] for name in asked))
+    with reporting(progress, seen.count) as report:
+
+        def parts() -> Iterator[tuple[int, range, Tensor]]:
+            for order in seen.parts(max(_PART // sheets, 1)):
+                yield 0, order, _mean(cast, seen, order, asked, subpixels, seed)
+                report(order.stop)
+
+        image = canvas.filled(parts(), torch.zeros(0, dtype=dtype, device=device))
+    if channels is None:
+        return image
+    widths = [CHANNELS[name] for name in asked]
+    return dict(zip(asked, image.split(widths, -1), strict=True))
+
+
+def _mean(cast: Casting, seen: PixelRays, order: range, asked: Sequence[str], subpixels: int, seed: int) -> Tensor:
+    """Of all rays of some pixels."""
+    pixels = seen.pixels(order)
+    total = torch.zeros((), dtype=cast.dtype, device=pixels.device)
+    for place in _places(pixels, subpixels, seed):
+        total = total + cast(*seen.rays(pixels, place), asked)
+    return total / subpixels**2
+
+
+def _places(pixels: Tensor, subpixels: int, seed: int) -> Iterator[Place]:
+    """Where the rays of each pixel go through it: one place in each of its s × s parts."""
+    if subpixels == 1:
+        yield CENTER
+        return
+    for k in range(subpixels**2):
+        across, down = (jitter(seed, pixels * (2 * subpixels**2) + 2 * k + axis) for axis in range(2))
+        yield (k % subpixels + across) / subpixels, (k // subpixels + down) / subpixels
+
+
+def _check(
+    surface: Surface,
+    material: Material | None,
+    sheets: int,
+    subpixels: int,
+    channels: Sequence[str] | None,
+    dtype: torch.dtype,
+    camera: object,
+) -> None:
+    if not isinstance(surface, Surface):
+        raise TypeError(f"surface must be a Surface, such as a LevelSet(field, level); got {type(surface).__name__}")
+    if not isinstance(material, Material | None):
+        raise TypeError(f"material must be a Material, or None for Phong(); got {type(material).__name__}")
+    if not isinstance(sheets, int) or not 1 <= sheets <= MAX_SHEETS:
+        raise ValueError(f"sheets must be an integer from 1 to {MAX_SHEETS}; got {sheets!r}")
+    if not isinstance(subpixels, int) or not 1 <= subpixels**2 <= _MOST_SUBPIXELS:
+        raise ValueError(f"subpixels must be an integer from 1 to 8, of rays per pixel and axis; got {subpixels!r}")
+    if subpixels > 1 and not isinstance(camera, Camera):
+        raise ValueError("subpixels go with a camera; rays bring their own places")
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype must be torch.float32 or torch.float64; got {dtype}")
+    unknown = [name for name in channels or () if name not in CHANNELS]
+    if unknown or (channels is not None and not channels):
+        raise ValueError(f"channels must be some of {', '.join(CHANNELS)}; got {channels!r}")
+    if subpixels > 1 and channels is not None and set(channels) != {"color"}:
+        raise ValueError("one ray a pixel for other channels than the colour: depths and normals have no mean")
