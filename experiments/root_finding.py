@@ -79,8 +79,13 @@ def units(config: Config) -> list[Unit]:
 
 def compute(config: Config, unit: Unit, run: Run) -> Record:
     """The record of one unit: for every solver how many answers were judged, and what they were."""
+    with torch.device(config.device):
+        return _computed(config, unit, run)
+
+
+def _computed(config: Config, unit: Unit, run: Run) -> Record:
     family, degree, dtype = config.work()[unit.key]
-    generator = torch.Generator().manual_seed(config.seed)
+    generator = torch.Generator(config.device).manual_seed(config.seed)
     found, done = Counter[str](), 0
     verdicts = {solver: Counter[str]() for solver in SOLVERS}
     examples: dict[str, list[float]] = {}

@@ -29,6 +29,7 @@ FLOORS = {
     "missing_values": 3,
     "signals": 4,
     "methods": 4,
+    "surfaces": 4,
     "resampling": 5,
     "spectrum": 5,
     "costs": 5,
@@ -144,13 +145,15 @@ def test_the_library_imports_neither_experiments_nor_tests(path):
 
 
 def test_the_floors_say_what_the_drawing_says():
-    """kernels, volume, bernstein, roots → prefilters → ops → fields → methods → render."""
-    flow = [FLOORS[name] for name in ("kernels", "prefilters", "ops", "fields", "methods", "render")]
-    assert flow == sorted(set(flow))
+    """kernels, volume, bernstein, roots → prefilters → ops → fields → methods, surfaces → render."""
+    for beside in ("methods", "surfaces"):
+        flow = [FLOORS[name] for name in ("kernels", "prefilters", "ops", "fields", beside, "render")]
+        assert flow == sorted(set(flow))
+    assert FLOORS["methods"] == FLOORS["surfaces"], "surfaces see fields, and never what made them"
 
 
 def test_the_oracle_is_independent():
-    for name in ("oracles.py", "laws.py"):
+    for name in ("oracles.py", "laws.py", "ray_oracle.py"):
         modules = imported_modules(ROOT / "tests" / name)
         assert not [m for m in modules if m.startswith(("filterlab", "experiments"))]
 

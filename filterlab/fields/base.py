@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -72,6 +72,13 @@ class ClosedForm:
     name: str = "closed form"
 
 
+class Relevant(NamedTuple):
+    """How many cells, and pieces in them, may hold a level: their Bernstein coefficients straddle it."""
+
+    cells: int
+    pieces: int
+
+
 class Field(ABC):
     """A function of space with value, gradient and (up to `max_order`) higher derivatives.
 
@@ -111,7 +118,14 @@ class Field(ABC):
         Raises:
             TypeError: the field is not piecewise polynomial. ValueError: it is batched.
         """
-        raise TypeError(f"{type(self).__name__} ({self.scheme.name}) is not piecewise polynomial along rays")
+        raise self._no_pieces()
+
+    def relevant(self, level: float) -> Relevant:
+        """How many cells of the domain, and pieces in them, may hold a level. Raises as `pieces_along` does."""
+        raise self._no_pieces()
+
+    def _no_pieces(self) -> TypeError:
+        return TypeError(f"{type(self).__name__} ({self.scheme.name}) is not piecewise polynomial along rays")
 
     @abstractmethod
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:

@@ -15,8 +15,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from filterlab.fields.base import Domain, Field, check_order, check_points
-from filterlab.fields.ranges import ranges
+from filterlab.fields.base import Domain, Field, Relevant, check_order, check_points
+from filterlab.fields.ranges import ranges, straddling
 from filterlab.fields.storage import Quantization, stored_as
 from filterlab.kernels import Factor, PiecewisePolynomial
 from filterlab.ops.differentiable.prefilter import implementation_for, prefilter_samples
@@ -284,10 +284,7 @@ class GridField(Field):
         return self.coefficients.lattice(self.scheme.terms)
 
     def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
-        if self.channels is not None:
-            raise ValueError("pieces are those of one channel: `select` it from this batched field")
-        if not self.scheme.exact:
-            return super().pieces_along(origins, directions, level)
+        self._check_pieces()
         dtype = torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
         lattice, geometry = self.lattice, self.domain.geometry
         own = geometry.to_voxel(origins.detach().double()), geometry.direction_to_voxel(directions.detach().double())
@@ -296,6 +293,17 @@ class GridField(Field):
             return pieces_of_rays(rays, lattice, dtype)
         bounds = ranges(lattice)
         return pieces_of_rays(rays, lattice, dtype, bounds.edge, bounds.may_hold(level, dtype))
+
+    def relevant(self, level: float) -> Relevant:
+        self._check_pieces()
+        cells = straddling(self.lattice, level)
+        return Relevant(cells, cells)
+
+    def _check_pieces(self) -> None:
+        if self.channels is not None:
+            raise ValueError("pieces are those of one channel: `select` it from this batched field")
+        if not self.scheme.exact:
+            raise self._no_pieces()
 
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         check_order(order, self.max_order)

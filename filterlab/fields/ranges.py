@@ -102,6 +102,11 @@ def layers_of(lattice: Lattice, edge: int) -> Iterator[tuple[Tensor, Tensor]]:
         yield low, high
 
 
+def straddling(lattice: Lattice, level: float) -> int:
+    """How many cells have Bernstein coefficients on both sides of a level, or on it."""
+    return sum(int(((low <= level) & (level <= high)).sum()) for low, high in layers_of(lattice, 1))
+
+
 def _columns(lattice: Lattice) -> list[int]:
     """Coefficients along x, y, z that a cell has of its own: its last one is the next cell's first where both agree."""
     return [p if lattice.continuous else p + 1 for p in lattice.degrees]

@@ -1,0 +1,284 @@
+"""What a ray can hit: the zeros of a function F, what is known of them, and how they move.
+
+Letters: a ray is o + t d, t ≥ 0, with d of any length, so t is in units of d; g = ∇F.
+
+A hit is found without derivatives and gets them from Newton's method: with the slope s = g·d held fixed, each step
+
+    t ← t − F(o + t d) / s
+
+makes t right to one more order in whatever o, d and F depend on. Two steps are attached: first and second derivatives
+in samples, level and rays are exact, and t itself keeps its bits. s is the derivative of F along the ray itself,
+whatever a field gives as its gradient. Where it is 0, at tangents, a hit has no derivative, and gets 0.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from filterlab.fields.base import Domain, check_order
+
+MAX_SHEETS = 4096
+_STEPS = 2  # of Newton's method: derivatives up to the second
+_FAR = 64  # diameters of the domain from which on o + t d is polished
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where rays meet a surface.
+
+    Attributes:
+        t: (...) in units of each ray's direction, ∞ where there is none; differentiable.
+    """
+
+    t: Tensor
+
+    @property
+    def valid(self) -> Tensor:
+        """(...) bool."""
+        return self.t.detach() < torch.inf
+
+
+class SurfacePoints(NamedTuple):
+    """What is known of a surface where rays hit it; 0 where they don't.
+
+    Attributes:
+        point: (..., 3), in the world.
+        gradient: ∇F (..., 3) per world unit, as the field gives it; None for order 0.
+        normal: ∇F / |∇F| (..., 3), towards greater values; 0 where the gradient is.
+        curvatures: κ₁ ≥ κ₂ (..., 2) per world unit: along a principal direction v the normal n turns by ∂n/∂v = κ v, so
+            that a ball of greater values than around it has −1/r twice; None below order 2.
+        principal: v₁, v₂ (..., 2, 3), unit vectors, at right angles with each other and the normal.
+    """
+
+    point: Tensor
+    gradient: Tensor | None = None
+    normal: Tensor | None = None
+    curvatures: Tensor | None = None
+    principal: Tensor | None = None
+
+
+class Surface(ABC):
+    """The zeros of a function in a domain.
+
+    Attributes:
+        domain: the box that the surface lies in.
+        max_order: of derivatives of F: 2 where curvatures can be given.
+    """
+
+    domain: Domain
+    max_order: int
+
+    @abstractmethod
+    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+        """F, and its gradient and Hessian up to an order, at world points (..., 3)."""
+
+    @abstractmethod
+    def _first(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """t (R,) of the first hit of rays (R, 3), ∞ where none."""
+
+    @abstractmethod
+    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
+        """t (R, sheets) of the first hits in order, or of the last ones from the last on; ∞ where no more."""
+
+    def hit(self, origins: Tensor, directions: Tensor) -> Hits:
+        """The first hit of every ray in the domain, t ≥ 0.
+
+        Args:
+            origins: world points (..., 3), float32 or float64.
+            directions: (..., 3), of any length but 0; the leading axes broadcast.
+
+        Returns:
+            t (...), in the type of the rays. Differentiable twice in the rays and in whatever F depends on.
+
+        Raises:
+            TypeError, ValueError: no such rays: another type or shape, numbers that are not finite, no direction.
+        """
+        origins, directions = check_rays(origins, directions)
+        t = _by_ray(self._first, origins, directions)
+        return Hits(self._attached(t, origins, directions))
+
+    def hits(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool = False) -> Hits:
+        """The first `sheets` hits of every ray in order; the last ones, from the last on, where `farthest`.
+
+        Args:
+            origins, directions: as for `hit`.
+            sheets: k, at most `MAX_SHEETS`.
+
+        Returns:
+            t (..., k), ∞ where there are no more. Differentiable as that of `hit`.
+
+        Raises:
+            TypeError, ValueError: as `hit`; another number of sheets.
+        """
+        if isinstance(sheets, bool) or not isinstance(sheets, int) or not 1 <= sheets <= MAX_SHEETS:
+            raise ValueError(f"sheets must be an integer from 1 to {MAX_SHEETS}; got {sheets!r}")
+        origins, directions = check_rays(origins, directions)
+        t = _by_ray(lambda o, d: self._sheets(o, d, sheets, farthest), origins, directions)
+        return Hits(self._attached(t, origins[..., None, :], directions[..., None, :]))
+
+    def at(self, origins: Tensor, directions: Tensor, hit: Hits, order: int = 1) -> SurfacePoints:
+        """What is known of the surface at hits.
+
+        Args:
+            origins, directions: the rays (..., 3).
+            hit: theirs: t (...), or (..., k) of k sheets.
+            order: 0 points, 1 with gradients and normals, 2 with curvatures.
+
+        Returns:
+            tensors of the shape of t and their own. Differentiable as hit.t is: hits found without derivatives have
+            none here either.
+
+        Raises:
+            ValueError: an order that the field cannot give; hits of other rays.
+        """
+        check_order(order, self.max_order)
+        origins, directions = check_rays(origins, directions)
+        shape, rays = hit.t.shape, origins.shape[:-1]
+        if shape == (*rays, *shape[len(rays) :]) and len(shape) == len(rays) + 1:
+            origins, directions = origins[..., None, :], directions[..., None, :]
+        elif shape != rays:
+            raise ValueError(f"hits of rays {tuple(rays)} have t of that shape, or (..., k); got {tuple(shape)}")
+        valid = hit.valid
+        o, d = (x.expand(*shape, 3)[valid] for x in (origins, directions))
+        point = self._polished(o, d, hit.t[valid])
+        rows = _geometry(point, self.jet(point, order)[1:]) if order else SurfacePoints(point)
+        others = (None if row is None else _spread(row, valid) for row in rows[1:])
+        return SurfacePoints(_spread(rows.point, valid), *others)
+
+    def _value(self, points: Tensor) -> Tensor:
+        return self.jet(points, 0)[0]
+
+    def _slope(self, points: Tensor, directions: Tensor) -> Tensor:
+        """∇F·d of F itself, not of what a field calls its gradient; 1 / s is 0 where it is 0: ∞ stands there."""
+        with torch.enable_grad():
+            x = points.detach().requires_grad_()
+            (gradient,) = torch.autograd.grad(self._value(x).sum(), x)
+        slope = (gradient * directions.detach()).sum(-1)
+        return torch.where(slope == 0, torch.inf, slope)
+
+    def _attached(self, t: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
+        """The same t, with derivatives."""
+        valid = t < torch.inf
+        if not torch.is_grad_enabled() or not bool(valid.any()):
+            return t
+        o, d = (x.expand(*t.shape, 3)[valid] for x in (origins, directions))
+        own = t[valid]
+        if not self._value(_along(o[:1], d[:1], own[:1])).requires_grad:
+            return t
+        slope = self._slope(_along(o, d, own), d)
+        for _ in range(_STEPS):
+            value = self._value(_along(o, d, own))
+            own = own - (value - value.detach()) / slope
+        return t.masked_scatter(valid, own)
+
+    def _polished(self, origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
+        """o + t d; far from where rays begin moved along them by what it was rounded by."""
+        point = _along(origins, directions, t)
+        way = torch.maximum(origins.detach().abs().amax(-1), (t.detach()[:, None] * directions.detach()).abs().amax(-1))
+        far = way > _FAR * (self.domain.diagonal + max(map(abs, self.domain.center)))
+        if not bool(far.any()):
+            return point
+        x, d = point.detach()[far], directions.detach()[far]
+        with torch.no_grad():
+            back = -self._value(x) / self._slope(x, d)
+            length = d.norm(dim=-1)
+            most = 8 * torch.finfo(x.dtype).eps * way[far] / length
+            moved = back.clamp(-most, most)[:, None] * d
+        return point.index_add(0, far.nonzero()[:, 0], moved)
+
+
+def check_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Both (..., 3), broadcast, in promote(origins, directions, float32). Raises what `Surface.hit` says."""
+    for name, x in (("origins", origins), ("directions", directions)):
+        if not isinstance(x, Tensor) or not x.dtype.is_floating_point:
+            found = x.dtype if isinstance(x, Tensor) else type(x).__name__
+            raise TypeError(f"{name} must be a floating-point torch.Tensor; got {found}")
+        if x.ndim == 0 or x.shape[-1] != 3:
+            raise ValueError(f"{name} must have shape (..., 3) in x, y, z order; got {tuple(x.shape)}")
+        if not bool(x.detach().isfinite().all()):
+            wrong = int((~x.detach().isfinite()).any(-1).sum())
+            raise ValueError(f"{name} must be finite; {wrong} rays are not")
+    if none := int((directions.detach() == 0).all(-1).sum()):
+        raise ValueError(f"directions must not be zero; {none} rays have none")
+    dtype = torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
+    try:
+        origins, directions = torch.broadcast_tensors(origins.to(dtype), directions.to(dtype))
+    except RuntimeError:
+        raise ValueError(
+            "origins and directions must have shapes (..., 3) that broadcast; "
+            f"got {tuple(origins.shape)} and {tuple(directions.shape)}"
+        ) from None
+    return origins, directions
+
+
+def _by_ray(search: Callable[[Tensor, Tensor], Tensor], origins: Tensor, directions: Tensor) -> Tensor:
+    """What a search of flat rays (R, 3) finds, in the shape of the rays and their type."""
+    with torch.no_grad():
+        found = search(origins.detach().reshape(-1, 3), directions.detach().reshape(-1, 3))
+    return found.reshape(origins.shape[:-1] + found.shape[1:]).to(origins.dtype)
+
+
+def _along(origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
+    return origins + t[..., None] * directions
+
+
+def _spread(rows: Tensor, valid: Tensor) -> Tensor:
+    """Rows of the valid entries at their places, 0 elsewhere."""
+    out = rows.new_zeros(*valid.shape, *rows.shape[1:])
+    return out.index_put((valid,), rows)
+
+
+# --- the geometry of a level set --------------------------------------------------------------------------------------
+
+
+def _geometry(point: Tensor, derivatives: tuple[Tensor, ...]) -> SurfacePoints:
+    gradient, *hessian = derivatives
+    size = _length(gradient)
+    normal = gradient / size[..., None]
+    if not hessian:
+        return SurfacePoints(point, gradient, normal)
+    return SurfacePoints(point, gradient, normal, *_curvatures(normal, hessian[0] / size[..., None, None]))
+
+
+def _length(vectors: Tensor) -> Tensor:
+    """|v|, with a finite derivative where v is 0: there it is 1."""
+    square = (vectors * vectors).sum(-1)
+    return torch.where(square == 0, 1, square).sqrt()
+
+
+def _curvatures(normal: Tensor, hessian: Tensor) -> tuple[Tensor, Tensor]:
+    """(κ₁, κ₂) (M, 2) and v₁, v₂ (M, 2, 3) from n and H / |g|: eigenvalues and -vectors of H on the tangent plane.
+
+    With a, b, c the entries of H in a basis of it: κ = (a + c)/2 ± r, r = hypot((a − c)/2, b), and v₁ at half the angle
+    of ((a − c)/2, b). Where r = 0 every direction is principal; the basis is returned, with derivative 0.
+    """
+    first, second = _tangents(normal)
+    bend = lambda u, v: torch.einsum("...i,...ij,...j->...", u, hessian, v)  # noqa: E731
+    a, b, c = bend(first, first), bend(first, second), bend(second, second)
+    middle, x = (a + c) / 2, (a - c) / 2
+    square = x * x + b * b
+    round_ = square == 0
+    r = torch.where(round_, 0, torch.where(round_, 1, square).sqrt())
+    angle = torch.where(round_, 0, torch.atan2(torch.where(round_, 0, b), torch.where(round_, 1, x)) / 2)
+    cos, sin = angle.cos()[..., None], angle.sin()[..., None]
+    principal = torch.stack((cos * first + sin * second, cos * second - sin * first), -2)
+    return torch.stack((middle + r, middle - r), -1), principal
+
+
+def _tangents(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors at right angles to a unit vector and each other.
+
+    Source: Duff et al., Building an orthonormal basis, revisited, JCGT 2017.
+    """
+    x, y, z = normal.unbind(-1)
+    sign = torch.where(z < 0, -1.0, 1.0).to(normal)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = torch.stack((1 + sign * x * x * a, sign * b, -sign * x), -1)
+    return first, torch.stack((b, sign + y * y * a, -y), -1)

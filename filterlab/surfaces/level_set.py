@@ -1,0 +1,166 @@
+"""Level sets of fields, found exactly along rays: every crossing, and no other.
+
+A field that is piecewise polynomial is a row of univariate polynomials along a ray. Bricks whose bounds leave out the
+level are passed over; of the pieces left, those whose Bernstein coefficients lie on one side of it hold no root; in the
+others the root search of `filterlab.roots` cannot miss one. Nothing is stepped, and a new level needs no preparation.
+
+| case | what is a hit |
+|---|---|
+| f = level between two pieces | one hit: both have the same value there, to the bit |
+| a ray touches the level | one hit, if it does within the rounding of the piece's coefficients (`filterlab.roots`) |
+| a stretch of a ray lies on the level | one hit in every piece of it at most, the first where it begins |
+| the field jumps over the level from one piece to the next | one hit, at the knot |
+| a ray begins inside, or on the surface | as any other: a surface has no inside; t = 0 where f(o) = level |
+| the surface leaves the domain | it ends there, open |
+| coefficients that are not finite | no hit in cells that read them: a hole |
+| a level that no value has | no hit |
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from filterlab.fields.base import Field, Relevant
+from filterlab.roots import MAX_DEGREE, all_roots, first_root
+from filterlab.surfaces.base import Surface
+
+PIECES_AT_ONCE = 1 << 19  # at most, of as many rays as may have so many
+
+
+class _Candidates(NamedTuple):
+    """Pieces that may hold a hit.
+
+    Attributes:
+        ray: (Q,) int64. start, near, far: (Q,) float64, as in `Pieces`.
+        coefficients: (Q, n + 1) of f − level.
+        jump: (Q,) whether f jumps over the level where the piece begins.
+        repeated: (Q,) whether the piece begins on the level where the one before ended on it.
+    """
+
+    ray: Tensor
+    start: Tensor
+    near: Tensor
+    far: Tensor
+    coefficients: Tensor
+    jump: Tensor
+    repeated: Tensor
+
+    def t(self, within: Tensor) -> Tensor:
+        """(Q, …) in units of the direction, of parameters in [0, 1]; ∞ stays."""
+        start, near, far = (x.view(-1, *(1,) * (within.ndim - 1)) for x in (self.start, self.near, self.far))
+        found = within < torch.inf
+        return torch.where(found, start + torch.lerp(near, far, torch.where(found, within, 0).double()), torch.inf)
+
+
+class LevelSet(Surface):
+    """The points where a field has a value: f = level.
+
+    Args:
+        field: unbatched, piecewise polynomial along rays, of degree 9 at most: any method made of kernels of degree 3.
+        level: a finite number, or a tensor of no axes, in which hits are then differentiable.
+
+    Raises:
+        TypeError: no Field; a field with no pieces. ValueError: a batched field, a higher degree, no finite level.
+    """
+
+    def __init__(self, field: Field, level: float | Tensor) -> None:
+        self.field, self.level = _checked(field), _checked_level(level)
+        self.domain, self.max_order = field.domain, field.max_order
+
+    def __repr__(self) -> str:
+        return f"LevelSet({self.field!r}, level={self._number:g})"
+
+    @property
+    def _number(self) -> float:
+        return _number(self.level)
+
+    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+        value, *derivatives = self.field.jet(points, order)
+        return value - self.level, *derivatives
+
+    def relevant(self) -> Relevant:
+        """How many cells of the domain, and pieces in them, may hold the level: their coefficients straddle it."""
+        return self.field.relevant(self._number)
+
+    def _first(self, origins: Tensor, directions: Tensor) -> Tensor:
+        t = origins.new_full((len(origins),), math.inf, dtype=torch.float64)
+        for part in self._parts(origins):
+            found = self._candidates(origins[part], directions[part])
+            within = torch.where(found.jump, 0, first_root(found.coefficients))
+            t[part] = t[part].scatter_reduce(0, found.ray, found.t(within), "amin")
+        return t
+
+    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
+        t = origins.new_full((len(origins), sheets), math.inf, dtype=torch.float64)
+        for part in self._parts(origins):
+            found = self._candidates(origins[part], directions[part])
+            within = all_roots(found.coefficients).t
+            within = torch.where(found.repeated[:, None] & (within == 0), math.inf, within)
+            jump = torch.where(found.jump, 0, torch.inf).to(within)
+            every = found.t(torch.cat((jump[:, None], within), 1))
+            hit = every < math.inf
+            ray = found.ray[:, None].expand_as(every)[hit]
+            t[part] = _in_order(ray, every[hit], t[part], farthest)
+        return t
+
+    def _parts(self, rays: Tensor) -> list[slice]:
+        """Rays at a time, so that memory does not grow with their number."""
+        box = zip(self.domain.lower, self.domain.upper, strict=True)
+        most = sum(math.ceil(upper - lower) + 2 for lower, upper in box)
+        step = max(1, PIECES_AT_ONCE // most)
+        return [slice(first, first + step) for first in range(0, len(rays), step)]
+
+    def _candidates(self, origins: Tensor, directions: Tensor) -> _Candidates:
+        pieces = self.field.pieces_along(origins, directions, self._number)
+        c = pieces.coefficients - self._number
+        low, high = c.aminmax(dim=-1) if len(c) else (c[:, 0], c[:, 0])
+        jump, repeated = torch.zeros_like(pieces.ray, dtype=torch.bool), torch.zeros_like(pieces.ray, dtype=torch.bool)
+        joined, before, after = pieces.joined[1:], c[:-1, -1], c[1:, 0]
+        jump[1:] = joined & (before.sign() * after.sign() < 0)
+        repeated[1:] = joined & (before == 0) & (after == 0)
+        keep = ((low <= 0) & (high >= 0)) | jump
+        rows = (pieces.ray, pieces.start[pieces.ray], pieces.near, pieces.far, c, jump, repeated)
+        return _Candidates(*(row[keep] for row in rows))
+
+
+def _in_order(ray: Tensor, t: Tensor, empty: Tensor, farthest: bool) -> Tensor:
+    """(R, k): the hits t (M,) of rays in order, or from the last on, in the places of `empty`."""
+    order = t.argsort(descending=farthest, stable=True)
+    order = order[ray[order].argsort(stable=True)]
+    ray, t = ray[order], t[order]
+    rank = torch.arange(len(ray), device=ray.device) - torch.searchsorted(ray, ray)
+    fits = rank < empty.shape[1]
+    return empty.index_put((ray[fits], rank[fits]), t[fits])
+
+
+def _checked(field: Field) -> Field:
+    if not isinstance(field, Field):
+        raise TypeError(f"a level set is that of a Field; got {type(field).__name__}")
+    if field.channels is not None:
+        raise ValueError("a level set is that of one channel: `select` it from this batched field")
+    degree = field.degree_along_rays
+    if degree is None:
+        raise TypeError(f"{type(field).__name__} ({field.scheme.name}) is not piecewise polynomial along rays")
+    if degree > MAX_DEGREE:
+        raise ValueError(f"degrees along a ray go up to {MAX_DEGREE}, kernels of degree 3; this field has {degree}")
+    return field
+
+
+def _checked_level(level: float | Tensor) -> float | Tensor:
+    if isinstance(level, Tensor) and (level.ndim or not level.is_floating_point()):
+        raise ValueError(f"level must be a number, or a floating-point tensor of no axes; got {tuple(level.shape)}")
+    try:
+        fine = math.isfinite(_number(level))
+    except (TypeError, ValueError):
+        fine = False
+    if not fine:
+        raise ValueError(f"level must be a finite number; got {level!r}")
+    return level if isinstance(level, Tensor) else float(level)
+
+
+def _number(level: float | Tensor) -> float:
+    return float(level.detach()) if isinstance(level, Tensor) else float(level)

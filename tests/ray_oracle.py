@@ -1,0 +1,190 @@
+"""Where a ray crosses a level, found independently: the direct kernel sum, cut into monotone stretches.
+
+Nothing here imports filterlab. Between two planes of knots f(o + t d) is a polynomial of degree n; it is the one
+through n + 1 values of the sum over taps, written out from the kernels' textbook formulas. Its critical points are
+eigenvalues of the colleague matrix of its derivative; between neighbours of all ends and critical points it is
+monotone, so that every change of sign is one crossing, which bisection finds. Rays are `longdouble`, so that far
+origins round nothing.
+
+Where f comes closer to the level than `close` without a clear crossing (at a critical point, or an end of the domain),
+rounding decides what there is to hit: such rays are *undecided*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from tests import oracles
+
+DEGREES = {"trilinear": 3, "ncrsi": 5, "triquadratic": 6, "notch": 6, "catmull-rom": 9, "mitchell": 9, "tricubic": 9}
+_MARGIN = 6  # coefficients that are written out beyond the ends: the domain reaches ½ beyond, kernels 2
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Crossings of one ray.
+
+    Attributes:
+        t: in order.
+        undecided: how close f comes to the level without crossing it, where that is too close; else ∞.
+    """
+
+    t: np.ndarray
+    undecided: float
+
+
+class Sum:
+    """f(x) = Σ weight Σ_k c_k φ_x(x − k) φ_y(y − k) φ_z(z − k) from samples (D, H, W), at voxel coordinates (P, 3)."""
+
+    def __init__(self, method: str, samples: np.ndarray, boundary: str) -> None:
+        recipe = oracles.RECIPES["catmull-rom" if method == "ncrsi" else method]
+        self.size, self.degree = samples.shape[::-1], DEGREES[method]
+        c = np.asarray(samples, dtype=np.float64)
+        for axis, n in enumerate(c.shape):
+            index = np.arange(-_MARGIN, n + _MARGIN)
+            matrix = oracles.coefficient_matrix(recipe.deconvolve, boundary, n, index)
+            c = np.moveaxis(np.tensordot(matrix, c, (1, axis)), 0, axis)
+        self.coefficients = c
+        self.terms = [(1.0, (recipe.kernel,) * 3)]
+        if method == "ncrsi":
+            one = ("catmull-rom", "linear", "linear")
+            self.terms = [(1.0, one[-d:] + one[:-d]) for d in range(3)] + [(-2.0, ("linear",) * 3)]
+        reach = oracles.radius(oracles.PIECES[recipe.kernel])
+        self.knots = 0.0 if reach == int(reach) else 0.5  # of the planes between polynomials, modulo 1
+        self.taps = np.arange(int(np.ceil(2 * reach)))
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        first = np.floor(points - len(self.taps) / 2).astype(int) + 1
+        weights = {}
+        for name in {k for _, ks in self.terms for k in ks}:
+            for axis in range(3):
+                x = points[:, axis, None] - first[:, axis, None] - self.taps
+                weights[name, axis] = oracles.kernel(name, x.astype(np.float64))
+        total = np.zeros(len(points))
+        x, y, z = (first + _MARGIN).T
+        for i, j, k in product(self.taps, repeat=3):
+            c = self.coefficients[z + k, y + j, x + i]
+            for weight, (a, b, d) in self.terms:
+                total += weight * c * weights[a, 0][:, i] * weights[b, 1][:, j] * weights[d, 2][:, k]
+        return total
+
+
+def crossings(f: Sum, origins: np.ndarray, directions: np.ndarray, level: float, close: float = 1e-11) -> list[Truth]:
+    """Those of rays (R, 3) in voxel coordinates with the level, within the domain [−½, n − ½]³ and t ≥ 0."""
+    o, d = (np.asarray(x, dtype=np.longdouble) for x in (origins, directions))
+    ends = [_ends(f, *ray) for ray in zip(o, d, strict=True)]
+    ray = np.repeat(np.arange(len(o)), [max(len(e) - 1, 0) for e in ends])
+    if not len(ray):
+        return [Truth(np.zeros(0), np.inf)] * len(o)
+    low = np.concatenate([e[:-1] for e in ends])
+    high = np.concatenate([e[1:] for e in ends])
+    nodes = chebyshev.chebpts1(f.degree + 1)
+    t = low[:, None] + (high - low)[:, None] * (nodes + 1) / 2
+    values = f((o[ray, None] + t[..., None] * d[ray, None]).reshape(-1, 3)).reshape(t.shape) - level
+    c = np.linalg.solve(chebyshev.chebvander(nodes, f.degree), values.T)  # (n + 1, P)
+    stops = np.sort(np.concatenate((-np.ones((len(ray), 1)), _critical(c), np.ones((len(ray), 1))), 1), 1)
+    at = _value(c, stops)
+    found = [_one(ray == r, low, high, c, stops, at, close) for r in range(len(o))]
+    return found
+
+
+def _ends(f: Sum, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """t at which a ray enters the domain, passes planes of knots, and leaves it."""
+    near, far = np.longdouble(0), np.longdouble(np.inf)
+    for x, v, n in zip(o, d, f.size, strict=True):
+        if v == 0:
+            if not -0.5 <= x <= n - 0.5:
+                return np.zeros(0)
+            continue
+        a, b = sorted(((-0.5 - x) / v, (n - 0.5 - x) / v))
+        near, far = max(near, a), min(far, b)
+    if not near < far:
+        return np.zeros(0)
+    planes = [(np.arange(-1, n + 1) + f.knots - x) / v for x, v, n in zip(o, d, f.size, strict=True) if v != 0]
+    inner = np.concatenate(planes)
+    inner = np.sort(inner[(inner > near) & (inner < far)])
+    every = np.concatenate(([near], inner, [far]))
+    return np.concatenate((every[:1], every[1:][np.diff(every) > 1e-12 * (1 + abs(every[1:]))]))
+
+
+def _critical(c: np.ndarray) -> np.ndarray:
+    """(P, n − 1): real parts of the zeros of the derivatives, cut off at the ends."""
+    p = chebyshev.chebder(c)
+    m = len(p) - 1
+    scale = np.abs(p).max(0)
+    leading = np.where(np.abs(p[-1]) > 1e-13 * scale, p[-1], 1e-13 * scale + 1e-300)
+    matrix = np.zeros((p.shape[1], m, m))
+    for k in range(m - 1):
+        matrix[:, k, k + 1] = matrix[:, k + 1, k] = 0.5
+    if m > 1:
+        matrix[:, 0, 1] = 1.0  # x T_0 = T_1, x T_k = (T_(k−1) + T_(k+1)) / 2
+        matrix[:, m - 1] -= (p[:-1] / leading / 2).T
+    else:
+        matrix[:, 0, 0] = -p[0] / leading
+    return np.clip(np.nan_to_num(np.linalg.eigvals(matrix).real), -1, 1)
+
+
+def _value(c: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """(P, K) of polynomials (n + 1, P) at x (P, K)."""
+    return chebyshev.chebval(x.T, c[:, None] if c.ndim > 1 else c, tensor=False).T
+
+
+def _one(own: np.ndarray, low, high, c, stops, at, close: float) -> Truth:
+    if not own.any():
+        return Truth(np.zeros(0), np.inf)
+    low, high, c, stops, at = low[own], high[own], c[:, own], stops[own], at[own]
+    piece = np.repeat(np.arange(len(low)), stops.shape[1])
+    x, v = stops.ravel(), at.ravel()
+    turns = np.abs(v) < close  # too close to tell: fine where f is clearly monotone through it
+    before, after = np.roll(v, 1), np.roll(v, -1)
+    before[0], after[-1] = 0, 0
+    through = (np.abs(before) >= close) & (np.abs(after) >= close) & (before * after < 0)
+    inner = np.abs(x) < 1
+    doubt = np.abs(v[turns & (inner | ~through)])
+    if len(doubt):
+        return Truth(np.zeros(0), float(doubt.min()))
+    keep = ~turns
+    piece, x, v = piece[keep], x[keep], v[keep]
+    places = list(zip(piece, x, strict=True))
+    turns = np.nonzero(v[:-1] * v[1:] < 0)[0]
+    found = [_bisected(c, low, high, places[i], places[i + 1], v[i]) for i in turns]
+    return Truth(np.array(found), np.inf)
+
+
+def _bisected(c, low, high, start: tuple[int, float], end: tuple[int, float], sign: float) -> float:
+    """t between two places, (piece, x) each, where the polynomials change from the sign at the first."""
+    (p, a), (q, b) = start, end
+    while p < q:  # the pieces between, some of no length
+        if chebyshev.chebval(1.0, c[:, p]) * sign <= 0:
+            b, q = 1.0, p
+        else:
+            p, a = p + 1, -1.0
+    for _ in range(60):
+        middle = (a + b) / 2
+        a, b = (middle, b) if chebyshev.chebval(middle, c[:, p]) * sign > 0 else (a, middle)
+    return float(low[p] + (high[p] - low[p]) * np.longdouble(a + 1) / 2)
+
+
+def judged(truth: Sequence[Truth], t: np.ndarray, tolerance: float) -> dict[str, int]:
+    """Of hits t (R, k), ∞ where none: how many are missed, invented, out of place; and rays that are undecided.
+
+    Of fewer than all hits, k in all, the first ones count.
+    """
+    count = {"rays": len(truth), "hits": 0, "undecided": 0, "missed": 0, "invented": 0, "misplaced": 0}
+    for one, hits in zip(truth, t, strict=True):
+        if one.undecided < np.inf:
+            count["undecided"] += 1
+            continue
+        hits = hits[np.isfinite(hits)]
+        expected = one.t[: t.shape[1]]
+        count["hits"] += len(expected)
+        count["missed"] += max(len(expected) - len(hits), 0)
+        count["invented"] += max(len(hits) - len(expected), 0)
+        if len(hits) == len(expected):
+            count["misplaced"] += int((np.abs(hits - expected) > tolerance).sum())
+    return count
