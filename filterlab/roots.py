@@ -354,7 +354,8 @@ def _undecided(parts: _Parts, h: float, sure: Tensor, crossings: list[_Brackets]
 
     Descartes: no change of sign among the coefficients, no root; one, one root. By the differences of the
     coefficients, p is monotone, or has one extremum: then the signs at the ends tell the rest, except for a valley
-    between positive ends.
+    between positive ends. Where floats can't tell the ends of a part from one another, a change of sign between them is
+    a crossing, however often p changes its sign there.
     """
     rows = parts.rows
     negative = [r <= 0 for r in rows]
@@ -362,7 +363,8 @@ def _undecided(parts: _Parts, h: float, sure: Tensor, crossings: list[_Brackets]
     falling = [right < left for left, right in pairwise(rows)]
     simple = _changes(falling) <= 1
     open_, ends = changes > 0, negative[-1]
-    _note(parts, ends & (simple | (changes == 1)), h, crossings)
+    narrow = parts.a + h == parts.a
+    _note(parts, ends & (simple | (changes == 1) | narrow), h, crossings)
     _note(parts, open_ & ~ends & simple & falling[0], h, valleys)
     sure.scatter_reduce_(0, parts.owner, torch.where(ends, parts.a + h, inf), "amin")
     before = parts.a < sure.index_select(0, parts.owner)

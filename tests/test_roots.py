@@ -99,8 +99,29 @@ FOUND = {
             0.4880199432473047,
         ],
     ),
+    "three roots between two floats next to 1": (
+        torch.float32,
+        [
+            *[1.0916695325491332e-09, 476939616256.0, -17818.1171875],
+            *[0.0003973136190325022, -2.6604309033562146e-12],
+        ],
+    ),
     "odd changes of sign in both halves": (torch.float64, [0.98868226, -0.52122521, 0.24551128, -0.00716032]),
 }
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("degree", range(1, 10))
+def test_between_ends_of_opposite_signs_there_is_a_root(degree, dtype):
+    """However wide the scale of the coefficients: near either end several of them may lie between two floats."""
+    sign = torch.where(torch.rand(40_000, degree + 1) < 0.5, -1.0, 1.0).double()
+    sign[:, -1] = -sign[:, 0]
+    top = 25 if dtype == torch.float32 else 200
+    c = (sign * 10 ** ((2 * torch.rand(40_000, degree + 1, dtype=torch.float64) - 1) * top)).to(dtype)
+    c = torch.cat((c, c.abs().sort(1).values * (-1.0) ** torch.arange(degree + 1).to(dtype)))  # falls by orders
+    opposite = c[:, 0].sign() * c[:, -1].sign() < 0
+    assert (first_root(c[opposite]) <= 1).all()
+    assert (first_root(c[opposite].flip(1)) <= 1).all()
 
 
 @pytest.mark.parametrize("name", FOUND)
