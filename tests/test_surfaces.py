@@ -109,6 +109,12 @@ def test_every_crossing_is_found_and_no_other(method, boundary):
     assert undecided <= 3
 
 
+@pytest.mark.parametrize(("method", "boundary", "seed"), [("triquadratic", "border", 1404), ("tricubic", "wrap", 1418)])
+def test_nearly_tangent_rays_from_far(method, boundary, seed):
+    """Off by 2e-11 once: a slope of 0.03 makes of the rounding of o + t d thirty times as long a way."""
+    assert_all_found(method, boundary, from_far, 60, seed)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_oblique_geometry_moves_nothing(method):
     samples = noise(5, 6, 7)

@@ -26,6 +26,7 @@ from filterlab.fields.base import Domain, check_order
 MAX_SHEETS = 4096
 _STEPS = 2  # of Newton's method: derivatives up to the second
 _FAR = 64  # diameters of the domain from which on o + t d is polished
+_POLISH = 1e-3  # of a voxel, by at most: rays that are nearly tangents turn the rounding of o + t d into long ways
 
 
 @dataclass(frozen=True)
@@ -184,13 +185,20 @@ class Surface(ABC):
         far = way > _FAR * (self.domain.diagonal + max(map(abs, self.domain.center)))
         if not bool(far.any()):
             return point
-        x, d = point.detach()[far], directions.detach()[far]
         with torch.no_grad():
-            back = -self._value(x) / self._slope(x, d)
-            length = d.norm(dim=-1)
-            most = 8 * torch.finfo(x.dtype).eps * way[far] / length
-            moved = back.clamp(-most, most)[:, None] * d
+            moved = self._nearer(point.detach()[far], directions.detach()[far])
         return point.index_add(0, far.nonzero()[:, 0], moved)
+
+    def _nearer(self, points: Tensor, directions: Tensor) -> Tensor:
+        """By what points (M, 3) come nearer to the surface along rays: steps of Newton's method that lower |F|."""
+        most = _POLISH * self.domain.voxel_size / directions.norm(dim=-1)
+        moved = torch.zeros_like(points)
+        for _ in range(_STEPS):
+            value = self._value(points + moved)
+            step = -value / self._slope(points + moved, directions)
+            new = moved + step.clamp(-most, most)[:, None] * directions
+            moved = torch.where((self._value(points + new).abs() < value.abs())[:, None], new, moved)
+        return moved
 
 
 def check_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
