@@ -251,6 +251,14 @@ def test_bounds_see_what_is_written_to_coefficients():
     assert float(bounds.ranges(field.lattice).high.max()) == 9
 
 
+def test_bounds_see_what_is_written_to_a_kernel():
+    table = kernels.LINEAR.table().clone()
+    field = fl.reconstruct(samples(5, 5, 5), kernels.TensorKernel("scaled", table), prefilter=False)
+    low = bounds.ranges(field.lattice).low.clone()
+    table *= 3
+    assert torch.allclose(bounds.ranges(field.lattice).low, 27 * low)  # along three axes
+
+
 def test_bounds_of_what_is_not_finite_are_none():
     s = samples(12, 12, 12)
     s[9, 9, 9] = math.nan

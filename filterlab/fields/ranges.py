@@ -53,9 +53,12 @@ _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
 def ranges(lattice: Lattice, edge: int = EDGE) -> Ranges:
-    """Bounds of every brick; kept for as long as the coefficients are, and made anew after they were written to."""
+    """Bounds of every brick; kept for as long as the coefficients are, and made anew after they were written to.
+
+    Made anew every time for kernels that are tensors: these may change too.
+    """
     grid = lattice.coefficients.detach()
-    if grid.is_inference():  # these don't count how often they are written to
+    if grid.is_inference() or not lattice.exact:  # the former don't count how often they are written to
         return _made(lattice, edge)
     base = lattice.coefficients._base
     owner = lattice.coefficients if base is None else base

@@ -84,6 +84,11 @@ class Lattice:
         return Stencil((self.row,)).supports
 
     @cached_property
+    def exact(self) -> bool:
+        """Whether all kernels are fixed tables."""
+        return Stencil((self.row,)).exact
+
+    @cached_property
     def degrees(self) -> tuple[int, int, int]:
         """Degree of the polynomial of a cell in x, y and z."""
         x, y, z = (max(p.kernels[axis].degree for p in self.row) for axis in range(3))
