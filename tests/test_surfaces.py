@@ -464,3 +464,20 @@ def test_directions_may_have_any_length():
 
 def test_surfaces_are_public():
     assert set(surfaces.__all__) == {"Hits", "LevelSet", "Surface", "SurfacePoints"}
+
+
+def test_a_level_and_samples_that_change_in_place_are_seen() -> None:
+    """As an optimizer changes them: nothing that is kept from call to call may be of before."""
+    samples = torch.rand(6, 6, 6, dtype=torch.float64).requires_grad_()
+    level = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    field = fl.reconstruct(samples, "trilinear")
+    surface = LevelSet(field, level)
+    origins = torch.rand(200, 3, dtype=torch.float64) * 5 - torch.tensor([0.0, 0.0, 9.0])
+    directions = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(200, 3)
+    before = surface.hit(origins, directions).t.detach()
+    assert torch.equal(surface.met(origins, directions), before < torch.inf)
+    with torch.no_grad():
+        level.fill_(0.6)
+    changed = surface.hit(origins, directions).t.detach()
+    assert torch.equal(changed, LevelSet(field, 0.6).hit(origins, directions).t.detach())
+    assert not torch.equal(changed, before)

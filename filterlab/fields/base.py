@@ -151,6 +151,10 @@ class Field(ABC):
         center = torch.tensor([self.domain.center], dtype=torch.float64, device=self.device)
         return self.jet(center if self.channels is None else center[None], 0)[0].requires_grad
 
+    def detached(self) -> Field:
+        """The same field, by whose own numbers no derivatives are asked; itself where it cannot tell them apart."""
+        return self
+
     def select(self, n: int, c: int) -> Field:
         """The unbatched field of entry n and channel c of a batched one.
 

@@ -267,6 +267,12 @@ class GridField(Field):
         one._settle()
         return one
 
+    def detached(self) -> GridField:
+        """The same field, of coefficients that no derivatives are asked by; they are shared, not copied."""
+        if not self.requires_grad:
+            return self
+        return self.with_coefficients(replace(self.coefficients, values=self.coefficients.values.detach()))
+
     def _relative_to(self, origin: tuple[float, float, float]) -> GridField:
         """The grid moves instead: numbers of float64, no work for any point."""
         moved = copy(self)

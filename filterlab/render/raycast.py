@@ -104,8 +104,7 @@ class Casting:
             if not self.shadows or light.direction is None:  # a headlight shines wherever the eye sees
                 return None
             toward = light.toward(point).detach().expand_as(point)
-            with torch.no_grad():
-                return (~self.surface.hit(lifted, toward).valid).to(point)
+            return (~self.surface.met(lifted, toward)).to(point)
 
         return Seen(point, normal, direction, *curved, visibility)
 

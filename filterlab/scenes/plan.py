@@ -160,8 +160,7 @@ def _seconds_of_surface(prepared: PreparedSurface, rays: int) -> Quartiles:
     probe, taken = replace(prepared, size=small, scene=scene), []
     for _ in range(_REPEATS + 1):
         start = time.perf_counter()
-        with torch.no_grad():
-            probe.render().sum().item()
+        probe.render().sum().item()
         taken.append((time.perf_counter() - start) * rays / (small[0] * small[1]))
     return Quartiles.of(taken[1:])
 

@@ -79,6 +79,11 @@ class Surface(ABC):
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         """F, and its gradient and Hessian up to an order, at world points (..., 3)."""
 
+    @property
+    @abstractmethod
+    def detached(self) -> Surface:
+        """The same surface, of numbers that no derivatives are asked by: searching it records nothing."""
+
     @abstractmethod
     def _first(self, origins: Tensor, directions: Tensor) -> Tensor:
         """t (R,) of the first hit of rays (R, 3), ∞ where none."""
@@ -101,8 +106,12 @@ class Surface(ABC):
             TypeError, ValueError: no such rays: another type or shape, numbers that are not finite, no direction.
         """
         origins, directions = check_rays(origins, directions)
-        t = _by_ray(self._first, origins, directions)
+        t = _by_ray(self.detached._first, origins, directions)
         return Hits(self._attached(t, origins, directions))
+
+    def met(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """Whether rays hit it at all, (...) bool; arguments and errors as for `hit`. Nothing is recorded."""
+        return _by_ray(self.detached._first, *check_rays(origins, directions)) < torch.inf
 
     def hits(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool = False) -> Hits:
         """The first `sheets` hits of every ray in order; the last ones, from the last on, where `farthest`.
@@ -120,7 +129,7 @@ class Surface(ABC):
         if isinstance(sheets, bool) or not isinstance(sheets, int) or not 1 <= sheets <= MAX_SHEETS:
             raise ValueError(f"sheets must be an integer from 1 to {MAX_SHEETS}; got {sheets!r}")
         origins, directions = check_rays(origins, directions)
-        t = _by_ray(lambda o, d: self._sheets(o, d, sheets, farthest), origins, directions)
+        t = _by_ray(lambda o, d: self.detached._sheets(o, d, sheets, farthest), origins, directions)
         return Hits(self._attached(t, origins[..., None, :], directions[..., None, :]))
 
     def at(self, origins: Tensor, directions: Tensor, hit: Hits, order: int = 1) -> SurfacePoints:
@@ -185,8 +194,7 @@ class Surface(ABC):
         far = way > _FAR * (self.domain.diagonal + max(map(abs, self.domain.center)))
         if not bool(far.any()):
             return point
-        with torch.no_grad():
-            moved = self._nearer(point.detach()[far], directions.detach()[far])
+        moved = self.detached._nearer(point.detach()[far], directions.detach()[far]).detach()
         return point.index_add(0, far.nonzero()[:, 0], moved)
 
     def _nearer(self, points: Tensor, directions: Tensor) -> Tensor:
@@ -227,8 +235,7 @@ def check_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 
 def _by_ray(search: Callable[[Tensor, Tensor], Tensor], origins: Tensor, directions: Tensor) -> Tensor:
     """What a search of flat rays (R, 3) finds, in the shape of the rays and their type."""
-    with torch.no_grad():
-        found = search(origins.detach().reshape(-1, 3), directions.detach().reshape(-1, 3))
+    found = search(origins.detach().reshape(-1, 3), directions.detach().reshape(-1, 3)).detach()
     return found.reshape(origins.shape[:-1] + found.shape[1:]).to(origins.dtype)
 
 

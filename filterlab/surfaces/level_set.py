@@ -19,6 +19,7 @@ others the root search of `filterlab.roots` cannot miss one. Nothing is stepped,
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -81,6 +82,16 @@ class LevelSet(Surface):
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         value, *derivatives = self.field.jet(points, order)
         return value - self.level, *derivatives
+
+    @property
+    def detached(self) -> LevelSet:
+        """The same surface, of numbers that no derivatives are asked by; the level as it is now."""
+        return LevelSet(self._detached_field, self._number)
+
+    @cached_property
+    def _detached_field(self) -> Field:
+        """It shares the coefficients, and what is found out about them once."""
+        return self.field.detached()
 
     def relevant(self) -> Relevant:
         """How many cells of the domain, and pieces in them, may hold the level: their coefficients straddle it."""

@@ -143,6 +143,7 @@ def test_the_grad_mode_is_never_switched_where_ctrl_c_could_leave_it() -> None:
     found = {name: switching.findall(text) for name, text in texts.items()}
     assert {name: calls for name, calls in found.items() if calls} == {
         "ops/differentiable/march.py": ["enable_grad("],  # within the backward pass
+        "surfaces/base.py": ["enable_grad("],  # which leaves derivatives on, where that happens, and loses none
         "costs.py": ["no_grad("],  # which measures for seconds, and is told so
     }
 
