@@ -46,9 +46,9 @@ from filterlab.render.transfer import TransferFunction
 _PART = 1 << 16  # rays that are cut at a time; more would only leave the caches
 _PART_OF_GPU = 1 << 20  # fewer would leave it waiting for Python
 _MOST_SEGMENTS = 2.0**62  # of a ray, that can be counted; no limit on the number of samples is as high
-_BYTES_PER_RAY = 304
-"""While rays are cut and marched. Measured on a GPU, where torch counts every byte, of lit images of 2048² by parts of
-2¹⁸ and 2²⁰ rays: 298 and 282 beyond the image. Chords alone are 72, in the grid 48 more, light and depth 32."""
+_BYTES_PER_RAY = 256
+"""While rays are cut and marched, roughly. Measured on a GPU, where torch counts every byte, of lit images of 2048² by
+parts of 2¹⁸ and 2²⁰ rays: 298 and 282 beyond the image. Chords are 72 of them, in the grid 48, light and depth 32."""
 _BYTES_PER_RAY_SAVED = 512
 """The same while autograd records, of the fused marcher: 442 of 2²⁰ rays, image and derivatives included."""
 _DEFAULT = Sampling()

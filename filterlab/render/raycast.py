@@ -30,7 +30,7 @@ from filterlab.render.image import (
 from filterlab.render.materials import Material, Phong, Seen
 from filterlab.render.rays import Region, Spans, check_region, jitter, spans
 from filterlab.render.shading import Light
-from filterlab.surfaces.base import MAX_SHEETS, Hits, Surface, SurfacePoints
+from filterlab.surfaces.base import Hits, Surface, SurfacePoints, check_sheets
 
 _PART = 1 << 15  # rays at a time; what they meet is cut up further by the surface
 _LIFT = 1e-3  # voxels by which a ray to a light begins in front of the surface
@@ -229,8 +229,7 @@ def _check(
         raise TypeError(f"surface must be a Surface, such as a LevelSet(field, level); got {type(surface).__name__}")
     if not isinstance(material, Material | None):
         raise TypeError(f"material must be a Material, or None for Phong(); got {type(material).__name__}")
-    if not isinstance(sheets, int) or not 1 <= sheets <= MAX_SHEETS:
-        raise ValueError(f"sheets must be an integer from 1 to {MAX_SHEETS}; got {sheets!r}")
+    check_sheets(sheets)
     if not isinstance(subpixels, int) or not 1 <= subpixels**2 <= _MOST_SUBPIXELS:
         raise ValueError(f"subpixels must be an integer from 1 to 8, of rays per pixel and axis; got {subpixels!r}")
     if subpixels > 1 and not isinstance(camera, Camera):

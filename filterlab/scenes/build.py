@@ -10,7 +10,6 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -201,7 +200,7 @@ def _surface(
     return PreparedSurface(
         **shown,
         surface=LevelSet(field, asked.at(value_range)),
-        material=asked.material.build(Path()),
+        material=asked.material.build(),
         lights=tuple(lighting.build().lights),
     )
 

@@ -162,6 +162,11 @@ def find_volume(name: str, folder: Path = Path()) -> Path:
     raise ValueError(f"expected a volume file; found none at {looked}{hint}")
 
 
+def _folder(info: ValidationInfo) -> Path:
+    """That of the file that is being read."""
+    return Path((info.context or {}).get("folder", "."))
+
+
 def _packaged(package: str, inside: str) -> Path:
     spec = importlib.util.find_spec(package)
     if spec is None or not spec.submodule_search_locations:
@@ -490,7 +495,7 @@ class PhongModel(StrictModel):
     shininess: Annotated[float, Field(ge=1)] = 32.0
     opacity: Opacity = 1.0
 
-    def build(self, folder: Path) -> materials.Material:
+    def build(self) -> materials.Material:
         """The material."""
         weights = (self.ambient, self.diffuse, self.specular, self.shininess)
         return materials.Phong(self.color, *weights, opacity=self.opacity)
@@ -507,7 +512,7 @@ class ToonModel(StrictModel):
     ink: _ListedColor = (0.02, 0.02, 0.05)
     opacity: Opacity = 1.0
 
-    def build(self, folder: Path) -> materials.Material:
+    def build(self) -> materials.Material:
         """The material."""
         return materials.Toon(self.color, self.bands, self.ambient, self.contour, self.ink, self.opacity)
 
@@ -525,10 +530,10 @@ class ReflectionLinesModel(StrictModel):
 
     @model_validator(mode="after")
     def _valid(self) -> Self:
-        self.build(Path())
+        self.build()
         return self
 
-    def build(self, folder: Path) -> materials.Material:
+    def build(self) -> materials.Material:
         """The material."""
         return materials.ReflectionLines(self.axis, self.count, self.sharpness, self.bright, self.dark, self.opacity)
 
@@ -546,9 +551,15 @@ class EnvironmentModel(StrictModel):
     reflectivity: Annotated[float, Field(ge=0, le=1)] = 0.4
     opacity: Opacity = 1.0
 
-    def build(self, folder: Path) -> materials.Material:
-        """The material. Raises ValueError for a picture that is not there or can't be read."""
-        picture = None if self.picture is None else load_image(find_volume(self.picture, folder))
+    @field_validator("picture")
+    @classmethod
+    def _found(cls, picture: str | None, info: ValidationInfo) -> str | None:
+        """Looked for when the scene is read, as a volume is."""
+        return None if picture is None else str(find_volume(picture, _folder(info)))
+
+    def build(self) -> materials.Material:
+        """The material. Raises ValueError for a picture that can't be read."""
+        picture = None if self.picture is None else load_image(self.picture)
         return materials.Environment(picture, self.color, self.reflectivity, self.opacity)
 
 
@@ -628,8 +639,7 @@ class Scene(StrictModel):
     @classmethod
     def _found(cls, volume: VolumeFile | None, info: ValidationInfo) -> VolumeFile | None:
         """Looked for when the scene is read: nothing is computed before every file is known to be there."""
-        folder = Path((info.context or {}).get("folder", "."))
-        return None if volume is None else volume.model_copy(update={"file": str(volume.path(folder))})
+        return None if volume is None else volume.model_copy(update={"file": str(volume.path(_folder(info)))})
 
     @model_validator(mode="after")
     def _consistent(self) -> Scene:

@@ -8,10 +8,12 @@ scene ──▶ Prepared ──▶ Frame (dvr.prepare) ──▶ rays, segments,
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from filterlab.costs import Quartiles, coefficient_bytes
 from filterlab.fields.base import Field
@@ -157,11 +159,19 @@ def _seconds_of_surface(prepared: PreparedSurface, rays: int) -> Quartiles:
     scene = prepared.scene.model_copy(
         update={"surface": prepared.scene.surface.model_copy(update={"subpixels": 1})}  # type: ignore[union-attr]
     )
-    probe, taken = replace(prepared, size=small, scene=scene), []
+    probe = replace(prepared, size=small, scene=scene)
+    return _timed(probe.render, small[0] * small[1] / rays)
+
+
+def _timed(run: Callable[[], Tensor], share: float) -> Quartiles:
+    """Seconds of everything, from runs of a share of it; the first run, which compiles, does not count."""
+    taken = []
     for _ in range(_REPEATS + 1):
         start = time.perf_counter()
-        probe.render().sum().item()
-        taken.append((time.perf_counter() - start) * rays / (small[0] * small[1]))
+        found = run()
+        if found.device.type == "cuda":
+            torch.cuda.synchronize(found.device)
+        taken.append((time.perf_counter() - start) / share)
     return Quartiles.of(taken[1:])
 
 
@@ -211,16 +221,9 @@ def _some_rays(frame: Frame) -> Chords:
 
 
 def _seconds(frame: Frame, medium: Medium, some: Chords) -> Quartiles:
-    """Of all rays of all images, from runs of some; the first run, which compiles, does not count."""
+    """Of all rays of all images, from runs of some."""
     share = len(some.count) / (frame.pixels * len(frame.media))
-    taken = []
-    for _ in range(_REPEATS + 1):
-        start = time.perf_counter()
-        light, _ = frame.marcher.march(medium, some, lambda done: None)
-        if light.device.type == "cuda":
-            torch.cuda.synchronize(light.device)
-        taken.append((time.perf_counter() - start) / share)
-    return Quartiles.of(taken[1:])
+    return _timed(lambda: frame.marcher.march(medium, some, lambda done: None)[0], share)
 
 
 def _skipped(frame: Frame, medium: Medium, some: Chords) -> tuple[float | None, float | None]:

@@ -126,8 +126,7 @@ class Surface(ABC):
         Raises:
             TypeError, ValueError: as `hit`; another number of sheets.
         """
-        if isinstance(sheets, bool) or not isinstance(sheets, int) or not 1 <= sheets <= MAX_SHEETS:
-            raise ValueError(f"sheets must be an integer from 1 to {MAX_SHEETS}; got {sheets!r}")
+        check_sheets(sheets)
         origins, directions = check_rays(origins, directions)
         t = _by_ray(lambda o, d: self.detached._sheets(o, d, sheets, farthest), origins, directions)
         return Hits(self._attached(t, origins[..., None, :], directions[..., None, :]))
@@ -207,6 +206,12 @@ class Surface(ABC):
             new = moved + step.clamp(-most, most)[:, None] * directions
             moved = torch.where((self._value(points + new).abs() < value.abs())[:, None], new, moved)
         return moved
+
+
+def check_sheets(sheets: int) -> None:
+    """Raises ValueError unless so many hits of a ray can be asked for."""
+    if isinstance(sheets, bool) or not isinstance(sheets, int) or not 1 <= sheets <= MAX_SHEETS:
+        raise ValueError(f"sheets must be an integer from 1 to {MAX_SHEETS}; got {sheets!r}")
 
 
 def check_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

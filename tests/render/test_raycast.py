@@ -246,8 +246,7 @@ def test_colours_by_field_curvature_and_texture() -> None:
     seen = on_a_ball()
     table = TransferFunction([-1.0, 1.0], [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], [1.0, 1.0])
     field = reconstruct(torch.rand(5, 5, 5, dtype=F64), "trilinear")
-    for coloring, value in ((ByField(field, table), field(seen.point)),):
-        assert_near(coloring(seen)[:, 0], (value + 1) / 2, 1e-12)
+    assert_near(ByField(field, table)(seen)[:, 0], (field(seen.point) + 1) / 2, 1e-12)
     curved = seen._replace(curvatures=torch.tensor([[0.5, -0.7]], dtype=F64).expand(400, 2))
     for kind, value in (("mean", -0.1), ("gaussian", -0.35), ("largest", 0.7)):
         assert float(ByCurvature(table, kind)(curved)[0, 0]) == pytest.approx((value + 1) / 2)
