@@ -6,6 +6,7 @@ gives the same numbers; opacities are per voxel. The one light is the camera's o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,7 +17,7 @@ from torch import Tensor
 from filterlab import signals
 from filterlab.fields.base import Field
 from filterlab.methods import reconstruct
-from filterlab.render import PerspectiveCamera, Shading, TransferFunction, render
+from filterlab.render import PerspectiveCamera, Shading, TransferFunction, fused, render
 from filterlab.render.dvr import prepare
 from filterlab.render.rays import Region, spans
 from filterlab.render.sampling import Sampling
@@ -125,3 +126,16 @@ def _shell(center: float, width: float, height: float, haze: float) -> Tensor:
     v = torch.linspace(0, 1, 129)
     opacity = height * (1 - (v - center).abs() / width).clamp_min(0) + haze
     return torch.stack((v, 0.6 + 0 * v, 1 - v, opacity), -1)
+
+
+def without_skipping(call: Callable[[], Any]) -> Callable[[], Any]:
+    """The call, with empty bricks marched through as well."""
+
+    def wrapped() -> Any:
+        before, fused.SKIPPING = fused.SKIPPING, False
+        try:
+            return call()
+        finally:
+            fused.SKIPPING = before
+
+    return wrapped

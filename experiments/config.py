@@ -16,20 +16,13 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 import filterlab as fl
 from filterlab import signals
 from filterlab.fields.base import Domain
-from filterlab.io.config import ConfigError, Problem, StrictModel, load_config, unknown_name
+from filterlab.io.config import ConfigError, Problem, StrictModel, load_config
 from filterlab.io.volumes import files_of
 from filterlab.scenes.model import Reconstruction, SignalModel, VolumeFile
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
 
-def _known_method(name: str) -> str:
-    if name not in fl.METHODS:
-        raise ValueError(unknown_name("method", name, fl.METHODS))
-    return name
-
-
-MethodName = Annotated[str, AfterValidator(_known_method)]
 Dtype = Literal["float32", "float64"]
 BoundaryName = Literal["mirror", "reflect", "wrap", "border", "zeros"]
 

@@ -11,11 +11,12 @@ from typing import Annotated, Any, Literal
 import torch
 from pydantic import AfterValidator, Field
 
-from experiments.config import ExperimentConfig, MethodName, number
+from experiments.config import ExperimentConfig, number
 from experiments.extremes import CASES
 from experiments.extremes.contract import Case, Subject
 from experiments.runs import Record, Run, Unit
 from filterlab.io.config import unknown_name
+from filterlab.scenes.model import MethodName
 
 
 def _known_case(key: str) -> str:

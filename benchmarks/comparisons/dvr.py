@@ -13,9 +13,8 @@ from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, Tick, 
 from benchmarks.peers import marchers
 from benchmarks.probe import measured
 from benchmarks.records import Bar, Figure, Outcome, Spread, at_most
-from benchmarks.scene import Scene, blobs, marschner_lobb
+from benchmarks.scene import Scene, blobs, marschner_lobb, without_skipping
 from benchmarks.settings import Settings
-from filterlab.render import fused
 
 _BARS = {"direct": at_most("1/40"), "Dr.Jit loop": at_most("0.35"), "VTK fixed-point": at_most("0.3")}
 _STEPS = (200, 2000)
@@ -78,24 +77,13 @@ def _skipping(settings: Settings) -> Race:
     """The same image, bit by bit."""
     scene = blobs(settings.image_voxels, settings.image, threads=settings.threads)
     skipping = _contestant(scene, "triquadratic", "fused", "skipping")
-    everything = replace(skipping, name="not skipping", call=_without_skipping(skipping.call))
+    everything = replace(skipping, name="not skipping", call=without_skipping(skipping.call))
     return Race(
         f"{_described(scene)}, lit, 80 % of the bricks of 8³ voxels empty",
         [everything, skipping],
         [Ratio("skipping", "not skipping", at_most("0.4"))],
         tolerance=0.0,
     )
-
-
-def _without_skipping(call: Callable[[], Any]) -> Callable[[], Any]:
-    def wrapped() -> Any:
-        before, fused.SKIPPING = fused.SKIPPING, False
-        try:
-            return call()
-        finally:
-            fused.SKIPPING = before
-
-    return wrapped
 
 
 def _backward(settings: Settings) -> Race:

@@ -18,12 +18,11 @@ from torch import Tensor
 from benchmarks import workloads
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item
 from benchmarks.peers import cupy_march, cupy_ndimage, cupy_texture
-from benchmarks.scene import Scene, blobs, marschner_lobb
+from benchmarks.scene import Scene, blobs, marschner_lobb, without_skipping
 from benchmarks.settings import Settings
 from filterlab import ops
 from filterlab.kernels import bspline
 from filterlab.ops.differentiable.prefilter import prefilter_samples
-from filterlab.render import fused
 from filterlab.roots import first_root
 
 _POINTS = 16  # times as many as elsewhere
@@ -181,15 +180,7 @@ def _skipping(settings: Settings) -> Race:
     """The same image, bit by bit."""
     scene = _scene(settings, build=blobs)
     skipping = _frame(scene, "fused", "skipping")
-
-    def everything() -> Any:
-        before, fused.SKIPPING = fused.SKIPPING, False
-        try:
-            return skipping.call()
-        finally:
-            fused.SKIPPING = before
-
-    contestants = [replace(skipping, name="not skipping", call=everything), skipping]
+    contestants = [replace(skipping, name="not skipping", call=without_skipping(skipping.call)), skipping]
     what = f"{_described(scene)}, 80 % of the bricks of 8³ voxels empty"
     return Race(what, contestants, [Ratio("skipping", "not skipping")], tolerance=0.0)
 

@@ -52,6 +52,9 @@ def _known_method(name: str) -> str:
     return name
 
 
+MethodName = Annotated[str, AfterValidator(_known_method)]
+
+
 def _known_method_or_auto(name: str) -> str:
     if name not in (*METHODS, AUTO):
         raise ValueError(unknown_name("method", name, (*METHODS, AUTO)))
@@ -262,7 +265,7 @@ class Reconstruction(StrictModel):
         scheme: left out, the fastest that runs.
     """
 
-    name: Annotated[str, AfterValidator(_known_method)]
+    name: MethodName
     prefilter: bool = True
     gradient: Literal["analytic", "central"] | None = None
     scheme: Annotated[str | None, AfterValidator(scheme_named)] = None
