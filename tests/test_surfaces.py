@@ -303,12 +303,15 @@ def test_missing_voxels_are_holes(method):
     assert bool(b.t[b.valid].isfinite().all())
 
 
-def test_rays_of_any_shape_and_memory_by_parts(monkeypatch):
-    surface = LevelSet(fl.reconstruct(noise(6, 6, 6), "triquadratic"), 0.5)
+@pytest.mark.parametrize("scheme", ["fused", "direct"])
+def test_rays_of_any_shape_and_memory_by_parts(scheme, monkeypatch):
+    surface = LevelSet(fl.reconstruct(noise(6, 6, 6), "triquadratic", scheme=scheme), 0.5)
     origins, directions = map(torch.from_numpy, random(np.random.default_rng(4), 60))
     t = surface.hit(origins, directions).t
     sheets = surface.hits(origins, directions, 3)
-    monkeypatch.setattr("filterlab.surfaces.level_set.PIECES_AT_ONCE", 100)
+    monkeypatch.setattr("filterlab.surfaces.level_set.RAYS_AT_ONCE", 7)
+    monkeypatch.setattr("filterlab.ops.reference.raycast.PIECES_AT_ONCE", 100)
+    monkeypatch.setattr("filterlab.ops.cpu.raycast._NUMBERS_AT_ONCE", 100)
     shaped = origins.reshape(3, 4, 5, 3), directions.reshape(3, 4, 5, 3)
     assert torch.equal(surface.hit(*shaped).t, t.reshape(3, 4, 5))
     several = surface.hits(*shaped, 3)

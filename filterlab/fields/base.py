@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.pieces import Pieces
+from filterlab.ops.raycast import Candidates
+from filterlab.ops.reference import raycast
 from filterlab.volume import Geometry
 
 
@@ -119,6 +121,28 @@ class Field(ABC):
             TypeError: the field is not piecewise polynomial. ValueError: it is batched.
         """
         raise self._no_pieces()
+
+    def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
+        """Where rays first meet a level: t (R,) float64 in units of the direction, ∞ where they don't.
+
+        Args:
+            origins, directions: as for `pieces_along`. Not differentiable.
+
+        Raises:
+            TypeError, ValueError: as `pieces_along` does.
+        """
+        return raycast.first_of(self._candidates_at(level), origins, directions, self._most_pieces())
+
+    def crossing_candidates(self, origins: Tensor, directions: Tensor, level: float) -> Candidates:
+        """The pieces of rays that may hold a crossing of a level, those of a ray in order; the others hold none."""
+        return raycast.all_of(self._candidates_at(level), origins, directions, self._most_pieces())
+
+    def _candidates_at(self, level: float) -> raycast.Search:
+        return lambda o, d: raycast.candidates_of(self.pieces_along(o, d, level), level)
+
+    def _most_pieces(self) -> int:
+        """About how many pieces a ray has."""
+        return sum(math.ceil(b - a) + 1 for a, b in zip(self.domain.lower, self.domain.upper, strict=True))
 
     def relevant(self, level: float) -> Relevant:
         """How many cells of the domain, and pieces in them, may hold a level. Raises as `pieces_along` does."""

@@ -19,9 +19,11 @@ from filterlab.fields.base import Domain, Field, Relevant, check_order, check_po
 from filterlab.fields.ranges import ranges, straddling
 from filterlab.fields.storage import Quantization, stored_as
 from filterlab.kernels import Factor, PiecewisePolynomial
+from filterlab.ops.differentiable import raycast as casting
 from filterlab.ops.differentiable.prefilter import implementation_for, prefilter_samples
 from filterlab.ops.pieces import Lattice, Pieces
 from filterlab.ops.place import Placement
+from filterlab.ops.raycast import Candidates, Raycast
 from filterlab.ops.reference.pieces import pieces_of_rays
 from filterlab.ops.stencil import Product, Stencil
 from filterlab.prefilters import Prefilter
@@ -291,7 +293,7 @@ class GridField(Field):
 
     def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
         self._check_pieces()
-        dtype = torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
+        dtype = _type_of_rays(origins, directions)
         lattice, geometry = self.lattice, self.domain.geometry
         own = geometry.to_voxel(origins.detach().double()), geometry.direction_to_voxel(directions.detach().double())
         rays = own[0] - own[0].new_tensor(lattice.offset), own[1]
@@ -299,6 +301,26 @@ class GridField(Field):
             return pieces_of_rays(rays, lattice, dtype)
         bounds = ranges(lattice)
         return pieces_of_rays(rays, lattice, dtype, bounds.edge, bounds.may_hold(level, dtype))
+
+    def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
+        return casting.first(self._raycast(level, origins, directions), origins, directions, self._caster)
+
+    def crossing_candidates(self, origins: Tensor, directions: Tensor, level: float) -> Candidates:
+        return casting.candidates(self._raycast(level, origins, directions), origins, directions, self._caster)
+
+    def _raycast(self, level: float, origins: Tensor, directions: Tensor) -> Raycast:
+        self._check_pieces()
+        dtype = _type_of_rays(origins, directions)
+        lattice, geometry = self.lattice, self.domain.geometry
+        bounds = ranges(lattice)
+        return Raycast(
+            lattice, geometry.origin, geometry.inverse, level, dtype, bounds.leaps(level, dtype), bounds.edge
+        )
+
+    @property
+    def _caster(self) -> str | None:
+        """What casts rays: plain torch if that is how this field is evaluated, else what is fastest."""
+        return "reference" if self.scheme.name == "direct" else None
 
     def relevant(self, level: float) -> Relevant:
         self._check_pieces()
@@ -342,6 +364,10 @@ class GridField(Field):
     def _shaped(self, x: Tensor, shape: Sequence[int], *own: int) -> Tensor:
         """(N, C, M, *own) to (N, C, *P, *own), or (*P, *own) for an unbatched field."""
         return x.reshape((*(self.channels or ()), *shape, *own))
+
+
+def _type_of_rays(origins: Tensor, directions: Tensor) -> torch.dtype:
+    return torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
 
 
 _ROWS = (1, 3, 6)

@@ -14,7 +14,7 @@ finite has NaN for bounds, and may hold anything.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -22,30 +22,46 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from filterlab import bernstein
 from filterlab.ops.pieces import Lattice
+from filterlab.ops.raycast import leaps_of
 from filterlab.ops.stencil import Product
 
 EDGE = 4  # cells along an edge of a brick
 _ROUNDING = 64  # units of rounding that a sum of taps may lose, relative to Σ |w| · max |c|
 
 
-class Ranges(NamedTuple):
+@dataclass(frozen=True)
+class Ranges:
     """Between what values lie in bricks of `edge`³ cells.
 
     Attributes:
         low, high: (bz, by, bx) float64; NaN where a coefficient is not finite.
         largest: Σ |w| · max |c|, what rounding of a sum is relative to.
         edge: cells along an edge of a brick.
+        continuous: whether the field is: else a jump over a level may lie between bricks that don't hold it.
     """
 
     low: Tensor
     high: Tensor
     largest: float
     edge: int
+    continuous: bool = True
+    _leaps: dict[tuple[float, torch.dtype], Tensor] = field(default_factory=dict, repr=False, compare=False)
 
     def may_hold(self, level: float, dtype: torch.dtype) -> Tensor:
         """Which bricks may hold the level, (bz, by, bx), where values are computed in a dtype."""
+        if not self.continuous:
+            return torch.ones_like(self.low, dtype=torch.bool)
         margin = _ROUNDING * torch.finfo(dtype).eps * self.largest
         return ~((self.low > level + margin) | (self.high < level - margin))
+
+    def leaps(self, level: float, dtype: torch.dtype) -> Tensor:
+        """`ops.raycast.leaps_of` the same; the last one asked for is kept."""
+        found = self._leaps.get((level, dtype))
+        if found is None:
+            found = leaps_of(self.may_hold(level, dtype), self.edge)
+            self._leaps.clear()
+            self._leaps[level, dtype] = found
+        return found
 
 
 _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
@@ -77,7 +93,7 @@ def _made(lattice: Lattice, edge: int) -> Ranges:
     finite = torch.where(c.isfinite(), c, 0) if c.is_floating_point() else c
     least, most = finite.aminmax()
     largest = max(abs(float(least)), abs(float(most))) * _norm(lattice)
-    return Ranges(low, high, abs(lattice.scale) * largest + abs(lattice.shift), edge)
+    return Ranges(low, high, abs(lattice.scale) * largest + abs(lattice.shift), edge, lattice.continuous)
 
 
 def _norm(lattice: Lattice) -> float:

@@ -1,7 +1,7 @@
 """The numerical core: fused operations, their adjoints, and what they are checked against.
 
-    stencil ──▶ gather  place  prefilter  march ──▶ reference ──▶ cpu, cuda ──▶ differentiable ──▶ here
-    what is summed    descriptions of every op     plain twins    programs     choice, adjoint
+    stencil ──▶ gather  place  prefilter  march  raycast ──▶ reference ──▶ cpu, cuda ──▶ differentiable ──▶ here
+    what is summed    descriptions of every op              plain twins    programs     choice, adjoint
 
 Every op has the same five parts in the same places: what it is (`<op>`: frozen data, shapes, limits), the plain twin
 (`reference`), vector code (`cpu`), code for a GPU (`cuda`), and what makes it differentiable and chooses

@@ -20,41 +20,15 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from filterlab.fields.base import Field, Relevant
-from filterlab.roots import MAX_DEGREE, all_roots, first_root
+from filterlab.roots import MAX_DEGREE, all_roots
 from filterlab.surfaces.base import Surface
 
-PIECES_AT_ONCE = 1 << 19  # at most, of as many rays as may have so many
-
-
-class _Candidates(NamedTuple):
-    """Pieces that may hold a hit.
-
-    Attributes:
-        ray: (Q,) int64. start, near, far: (Q,) float64, as in `Pieces`.
-        coefficients: (Q, n + 1) of f − level.
-        jump: (Q,) whether f jumps over the level where the piece begins.
-        repeated: (Q,) whether the piece begins on the level where the one before ended on it.
-    """
-
-    ray: Tensor
-    start: Tensor
-    near: Tensor
-    far: Tensor
-    coefficients: Tensor
-    jump: Tensor
-    repeated: Tensor
-
-    def t(self, within: Tensor) -> Tensor:
-        """(Q, …) in units of the direction, of parameters in [0, 1]; ∞ stays."""
-        start, near, far = (x.view(-1, *(1,) * (within.ndim - 1)) for x in (self.start, self.near, self.far))
-        found = within < torch.inf
-        return torch.where(found, start + torch.lerp(near, far, torch.where(found, within, 0).double()), torch.inf)
+RAYS_AT_ONCE = 1 << 16  # whose sheets are sorted
 
 
 class LevelSet(Surface):
@@ -98,44 +72,22 @@ class LevelSet(Surface):
         return self.field.relevant(self._number)
 
     def _first(self, origins: Tensor, directions: Tensor) -> Tensor:
-        t = origins.new_full((len(origins),), math.inf, dtype=torch.float64)
-        for part in self._parts(origins):
-            found = self._candidates(origins[part], directions[part])
-            within = torch.where(found.jump, 0, first_root(found.coefficients))
-            t[part] = t[part].scatter_reduce(0, found.ray, found.t(within), "amin")
-        return t
+        return self.field.first_crossing(origins, directions, self._number)
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
-        t = origins.new_full((len(origins), sheets), math.inf, dtype=torch.float64)
-        for part in self._parts(origins):
-            found = self._candidates(origins[part], directions[part])
-            within = all_roots(found.coefficients).t
-            within = torch.where(found.repeated[:, None] & (within == 0), math.inf, within)
-            jump = torch.where(found.jump, 0, torch.inf).to(within)
-            every = found.t(torch.cat((jump[:, None], within), 1))
-            hit = every < math.inf
-            ray = found.ray[:, None].expand_as(every)[hit]
-            t[part] = _in_order(ray, every[hit], t[part], farthest)
-        return t
+        parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
+        return torch.cat([self._sheets_of_part(o, d, sheets, farthest) for o, d in parts])
 
-    def _parts(self, rays: Tensor) -> list[slice]:
-        """Rays at a time, so that memory does not grow with their number."""
-        box = zip(self.domain.lower, self.domain.upper, strict=True)
-        most = sum(math.ceil(upper - lower) + 2 for lower, upper in box)
-        step = max(1, PIECES_AT_ONCE // most)
-        return [slice(first, first + step) for first in range(0, len(rays), step)]
-
-    def _candidates(self, origins: Tensor, directions: Tensor) -> _Candidates:
-        pieces = self.field.pieces_along(origins, directions, self._number)
-        c = pieces.coefficients - self._number
-        low, high = c.aminmax(dim=-1) if len(c) else (c[:, 0], c[:, 0])
-        jump, repeated = torch.zeros_like(pieces.ray, dtype=torch.bool), torch.zeros_like(pieces.ray, dtype=torch.bool)
-        joined, before, after = pieces.joined[1:], c[:-1, -1], c[1:, 0]
-        jump[1:] = joined & (before.sign() * after.sign() < 0)
-        repeated[1:] = joined & (before == 0) & (after == 0)
-        keep = ((low <= 0) & (high >= 0)) | jump
-        rows = (pieces.ray, pieces.start[pieces.ray], pieces.near, pieces.far, c, jump, repeated)
-        return _Candidates(*(row[keep] for row in rows))
+    def _sheets_of_part(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
+        found = self.field.crossing_candidates(origins, directions, self._number)
+        within = all_roots(found.coefficients).t
+        within = torch.where(found.repeated[:, None] & (within == 0), math.inf, within)
+        jump = torch.where(found.jump, 0, torch.inf).to(within)
+        every = found.t(torch.cat((jump[:, None], within), 1))
+        hit = every < math.inf
+        ray = found.ray[:, None].expand_as(every)[hit]
+        empty = origins.new_full((len(origins), sheets), math.inf, dtype=torch.float64)
+        return _in_order(ray, every[hit], empty, farthest)
 
 
 def _in_order(ray: Tensor, t: Tensor, empty: Tensor, farthest: bool) -> Tensor:

@@ -1,0 +1,377 @@
+"""The program that casts rays at a level: rays in, hits out; or the pieces that may hold one.
+
+For a pack of P rays, until all have ended:
+
+    walk        every ray to its next cell that may hold the level (`ops.cpu.cells`)
+    restrict    the sum over taps on the ray's part in that cell, P at a time (`ops.cpu.restriction`)
+    signs       one change of sign among the coefficients of f − level: there is the hit, the ray waits for the end
+                several: the part that holds the first root is looked for at once (`ops.cpu.polynomials`)
+
+and then one root search for all of them. Pieces that hold no level never come to it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import comb
+
+from llvmlite import ir
+
+from filterlab.ops.cpu import frame, job
+from filterlab.ops.cpu.cells import Found, Walk
+from filterlab.ops.cpu.job import AXES
+from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, I8, I32, I64, STORAGE, Lanes, Value
+from filterlab.ops.cpu.polynomials import Part, Rows, Search
+from filterlab.ops.cpu.restriction import Restriction
+from filterlab.ops.cpu.taps import Grid
+from filterlab.ops.stencil import Lowered
+
+PACKS_OF_A_CHUNK = 16
+
+# Arrays are contiguous. R rays; "number" is the type of the arithmetic, d a double.
+FIELDS: dict[str, type] = {
+    "next": ctypes.c_int64,  # the chunk to be taken next; threads add 1 atomically
+    "coefficients": ctypes.c_void_p,  # the first tap of the first cell; rows together, planes as many rows as `height`
+    "width": ctypes.c_int64,
+    "height": ctypes.c_int64,
+    **{f"cells_{a}": ctypes.c_int64 for a in AXES},  # their number
+    "origins": ctypes.c_void_p,  # (R, 3) numbers, in the world
+    "directions": ctypes.c_void_p,  # (R, 3) numbers
+    "rays": ctypes.c_int64,  # R
+    "origin": ctypes.c_void_p,  # (3) d: coordinates of cells are matrix · (world − origin) − offset
+    "matrix": ctypes.c_void_p,  # (3, 3) d
+    "offset": ctypes.c_void_p,  # (3) d
+    "lower": ctypes.c_void_p,  # (3) d, corners of the domain in coordinates of cells
+    "upper": ctypes.c_void_p,  # (3) d
+    "scale": ctypes.c_double,  # f − level is scale · sum + shift
+    "shift": ctypes.c_double,
+    "leaps": ctypes.c_void_p,  # (bz, by, bx) bytes, see `ops.raycast.Raycast`
+    **{f"bricks_{a}": ctypes.c_int64 for a in AXES},  # their number
+    "edge": ctypes.c_int64,  # of a brick, log₂ of its cells
+    "t": ctypes.c_void_p,  # (R) d, written: where the first hit is
+    "capacity": ctypes.c_int64,  # K, candidates of a ray that there is room for
+    "count": ctypes.c_void_p,  # (R) int64, written: candidates of a ray, also those that there is no room for
+    "places": ctypes.c_void_p,  # (R, K, 3) d, written: start, near, far of candidates
+    "pieces": ctypes.c_void_p,  # (R, K, n + 1) numbers, written: Bernstein coefficients of f − level
+    "flags": ctypes.c_void_p,  # (R, K) bytes, written: 1 the field jumps over the level, 2 the piece is a repetition
+    "chunks": ctypes.c_int64,  # `next` stops here
+}
+
+JUMP, REPEATED = 1, 2
+
+
+class RaycastJob(job.Job):
+    _fields_ = tuple(FIELDS.items())
+
+
+@dataclass(frozen=True)
+class RaycastVariant:
+    """Everything the program depends on, apart from the machine.
+
+    Attributes:
+        asked: "first" or "candidates".
+        stencil: the sum over taps, one row.
+        degree: n, along a ray.
+        continuous: whether polynomials of neighbouring cells agree where they meet.
+        arithmetic: "float32" or "float64": of rays and polynomials.
+        storage: dtype of the coefficients.
+        room: whether there is a number behind the last coefficient, in the same storage.
+        lanes: P.
+    """
+
+    asked: str
+    stencil: Lowered
+    degree: int
+    continuous: bool
+    arithmetic: str
+    storage: str
+    room: bool
+    lanes: int
+
+    def generate(self) -> str:
+        """The program as LLVM IR text."""
+        module, function = frame.new_module()
+        (_First if self.asked == "first" else _Candidates)(self, function).write()
+        return str(module)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Pieces of a pack of rays.
+
+    Attributes:
+        found: where they are.
+        rows: coefficients of f − level.
+        whole: a mask of those that are finite.
+        joined: a mask of those that begin where the piece before ended.
+        before: the value with which that one ended.
+    """
+
+    found: Found
+    rows: Rows
+    whole: Value
+    joined: Value
+    before: Value
+
+
+class _Program:
+    """What both have in common: packs of rays, cells, pieces."""
+
+    def __init__(self, variant: RaycastVariant, function: ir.Function) -> None:
+        self.variant, self.function = variant, function
+        self.builder = ir.IRBuilder(function.append_basic_block("entry"))
+        self.lanes = Lanes(self.builder, variant.arithmetic, variant.lanes)
+        self.places = Lanes(self.builder, "float64", variant.lanes)
+        self.number, self.storage = ARITHMETIC[variant.arithmetic], STORAGE[variant.storage]
+
+    def write(self) -> None:
+        e, b, v = self.lanes, self.builder, self.variant
+        self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
+        no_ends = DOUBLE(0.0), DOUBLE(0.0), DOUBLE(0.0)
+        grid = Grid(j.width, j.height, I64(0), no_ends, no_ends)
+        self.restriction = Restriction(e, v.stencil, v.degree, self.storage, grid, v.room)
+        self.search = Search(e, v.degree)
+        self.walk = Walk(self.places, j)
+        self._ended_at = self.places.variable(self.places.constant(-1))
+        self._ended_with = e.variable(e.constant(0))
+        self.prepare()
+        packs = b.udiv(b.add(j.rays, I64(e.count - 1)), I64(e.count))
+        with frame.every_chunk(e, j) as chunk:
+            first = b.mul(chunk, I64(PACKS_OF_A_CHUNK))
+            with e.repeat(first, e.smaller(b.add(first, I64(PACKS_OF_A_CHUNK)), packs)) as pack:
+                self._cast(b.mul(pack, I64(e.count)))
+        b.ret_void()
+
+    def prepare(self) -> None:
+        """Make what is needed of variables."""
+
+    def begin(self) -> None:
+        """Before a pack's first cell."""
+
+    def waiting(self) -> Value:
+        """A mask of rays that need not go on."""
+        return self.walk.mask(False)
+
+    def take(self, first: Value, piece: Piece) -> None:
+        """Pieces that were found."""
+        raise NotImplementedError
+
+    def finish(self, first: Value, real: Value) -> None:
+        """A pack has ended."""
+
+    # --- a pack of rays ---
+
+    def _cast(self, first: Value) -> None:
+        e, b, walk = self.lanes, self.builder, self.walk
+        numbers = ir.Constant(ir.VectorType(I64, e.count), list(range(e.count)))
+        real = b.icmp_signed("<", b.add(numbers, e.everywhere(first)), e.everywhere(self.job.rays))
+        self.begin()
+        self._ended_at.value = self.places.constant(-1)
+        walk.begin(real, self._rays(self.job.origins, first), self._rays(self.job.directions, first))
+        going = lambda: e.any(b.and_(walk.going.value, b.not_(self.waiting())))  # noqa: E731
+        with e.repeat_while(going):
+            found = walk.next_cells(self.waiting())
+            with b.if_then(e.any(found.mask)):
+                self.take(first, self._piece(found))
+        self.finish(first, real)
+
+    def _rays(self, array: Value, first: Value) -> list[Value]:
+        """x, y, z of a pack of rays as doubles; those beyond the last are the last."""
+        e, b = self.lanes, self.builder
+        last = b.sub(self.job.rays, I64(1))
+        packs: list[Value] = [self.places.constant(0) for _ in AXES]
+        for lane in range(e.count):
+            ray = e.smaller(b.add(first, I64(lane)), last)
+            for axis in range(3):
+                place = e.advance(array, b.add(b.mul(ray, I64(3)), I64(axis)), self.number)
+                number = b.load(place, typ=self.number)
+                number = number if self.number == DOUBLE else b.fpext(number, DOUBLE)
+                packs[axis] = b.insert_element(packs[axis], number, I32(lane))
+        return packs
+
+    # --- pieces ---
+
+    def _piece(self, found: Found) -> Piece:
+        e, b, p, v = self.lanes, self.builder, self.places, self.variant
+        start, end = (self._within(found.cell, s) for s in (found.near, found.far))
+        total = self.restriction.restrict(self._taps(found.cell), start, end)
+        scale, shift = (e.everywhere(e.scalar(x)) for x in (self.job.scale, self.job.shift))
+        rows = [
+            e.multiply_add(e.multiply(c, e.constant(1 / comb(v.degree, i))), scale, shift) for i, c in enumerate(total)
+        ]
+        sum_ = rows[0]
+        for r in rows[1:]:
+            sum_ = e.add(sum_, r)
+        whole = b.fcmp_ordered("<", e.absolute(sum_), e.constant(float("inf")))
+        before = self._ended_with.value
+        joined = b.and_(found.mask, b.fcmp_ordered("==", found.near, self._ended_at.value))
+        joined = b.and_(joined, b.fcmp_ordered("<", e.absolute(before), e.constant(float("inf"))))
+        if v.continuous:
+            rows[0] = e.where(joined, before, rows[0])
+        self._ended_at.value = p.where(found.mask, found.far, self._ended_at.value)
+        self._ended_with.value = e.where(found.mask, rows[-1], before)
+        return Piece(found, rows, whole, joined, before)
+
+    def _within(self, cell: Sequence[Value], s: Value) -> list[Value]:
+        """Where rays are in their cells at s, in [0, 1]."""
+        p, b, walk = self.places, self.builder, self.walk
+        zero, one, out = p.constant(0), p.constant(1), []
+        for own, entry, direction in zip(cell, walk.entry, walk.direction, strict=True):
+            at = p.add(entry.value, p.multiply(s, direction.value))
+            place = p.clamp(p.subtract(at, b.sitofp(own, p.pack)), zero, one)
+            out.append(place if self.number == DOUBLE else b.fptrunc(place, self.lanes.pack))
+        return out
+
+    def _taps(self, cell: Sequence[Value]) -> list[Value]:
+        """The address of every lane's first tap."""
+        e, b, j = self.lanes, self.builder, self.job
+        x, y, z = cell
+        line = b.add(b.mul(z, e.everywhere(b.trunc(j.height, I32))), y)
+        offset = b.add(b.mul(e.widen(line), e.everywhere(j.width)), e.widen(x))
+        return [e.advance(j.coefficients, e.lane(offset, lane), self.storage.raw) for lane in range(e.count)]
+
+    def holds(self, piece: Piece, jump: Value) -> Value:
+        """A mask of pieces with coefficients on both sides of 0, or on it, or that the field jumps to."""
+        e, b = self.lanes, self.builder
+        low = high = piece.rows[0]
+        for r in piece.rows[1:]:
+            low, high = e.minimum(low, r), e.maximum(high, r)
+        zero = e.constant(0)
+        straddles = b.and_(b.fcmp_ordered("<=", low, zero), b.fcmp_ordered(">=", high, zero))
+        return b.and_(b.and_(piece.found.mask, piece.whole), b.or_(straddles, jump))
+
+    def jumps(self, piece: Piece) -> Value:
+        """A mask of pieces that begin on the other side of the level than the one before ended on."""
+        e, b = self.lanes, self.builder
+        if self.variant.continuous:
+            return self.walk.mask(False)
+        zero, begin, before = e.constant(0), piece.rows[0], piece.before
+        up = b.and_(b.fcmp_ordered("<", before, zero), b.fcmp_ordered(">", begin, zero))
+        down = b.and_(b.fcmp_ordered(">", before, zero), b.fcmp_ordered("<", begin, zero))
+        return b.and_(piece.joined, b.or_(up, down))
+
+    def length(self, s: Value) -> Value:
+        """In units of a ray's direction."""
+        return self.places.multiply(s, self.walk.scale.value)
+
+
+class _First(_Program):
+    """Every ray waits at its first hit, and all of a pack are searched together."""
+
+    def prepare(self) -> None:
+        e, p = self.lanes, self.places
+        self._part = Part.of(e, self.variant.degree)
+        self._near, self._far = p.variable(p.constant(0)), p.variable(p.constant(0))
+        self._hit, self._at_start, self._at_end = (e.variable(self.walk.mask(False)) for _ in range(3))
+
+    def begin(self) -> None:
+        self._hit.value = self._at_start.value = self._at_end.value = self.walk.mask(False)
+
+    def waiting(self) -> Value:
+        return self._hit.value
+
+    def take(self, first: Value, piece: Piece) -> None:
+        e, b = self.lanes, self.builder
+        jump = self.jumps(piece)
+        holds = self.holds(piece, jump)
+        with b.if_then(e.any(holds)):
+            self._keep(piece, holds, jump)
+
+    def _keep(self, piece: Piece, holds: Value, jump: Value) -> None:
+        """Keep a piece for the root search, if it has a root."""
+        e, b, search = self.lanes, self.builder, self.search
+        zero = e.constant(0)
+        begin, end = piece.rows[0], piece.rows[-1]
+        turn = e.where(b.fcmp_ordered("<", begin, zero), e.constant(-1), e.constant(1))
+        rows = [e.multiply(turn, r) for r in piece.rows]
+        at_start = b.and_(holds, b.or_(jump, b.fcmp_ordered("==", begin, zero)))
+        on_end = b.fcmp_ordered("==", end, zero)
+        tiny = e.constant(2.0**-126 if e.bits == 32 else 2.0**-1022)
+        rows[-1] = e.where(on_end, tiny, rows[-1])
+        changes = search.changes(search.negative(search.lowered(rows)))
+        inner = b.and_(holds, b.not_(at_start))
+        single = b.icmp_unsigned("==", changes, ir.Constant(changes.type, [1] * e.count))
+        below = b.fcmp_ordered("<", rows[-1], zero)
+        simple = b.and_(inner, b.and_(single, below))
+        self._part.assign(e, simple, rows, zero, e.constant(1))
+        found = e.variable(b.or_(at_start, simple))
+        hard = b.and_(inner, b.not_(simple))
+        with b.if_then(e.any(hard), likely=False):
+
+            def keep(mask: Value, rows: Rows, a: Value, h: Value) -> None:
+                self._part.assign(e, mask, rows, a, h)
+                found.value = b.or_(found.value, mask)
+
+            search.first_part(hard, rows, keep)
+        at_end = b.and_(b.and_(hard, on_end), b.not_(found.value))
+        hit = b.or_(found.value, at_end)
+        self._at_start.value = b.or_(self._at_start.value, at_start)
+        self._at_end.value = b.or_(self._at_end.value, at_end)
+        self._hit.value = b.or_(self._hit.value, hit)
+        self._near.value = self.places.where(hit, piece.found.near, self._near.value)
+        self._far.value = self.places.where(hit, piece.found.far, self._far.value)
+
+    def finish(self, first: Value, real: Value) -> None:
+        e, b, p = self.lanes, self.builder, self.places
+        hit, at_start, at_end = self._hit.value, self._at_start.value, self._at_end.value
+        t = e.variable(e.constant(0))
+        inner = b.and_(hit, b.not_(b.or_(at_start, at_end)))
+        with b.if_then(e.any(inner)):
+            within = self.search.root([r.value for r in self._part.rows], inner)
+            t.value = e.multiply_add(within, self._part.h.value, self._part.a.value)
+        own = e.where(at_start, e.constant(0), e.where(at_end, e.constant(1), t.value))
+        own = own if self.number == DOUBLE else b.fpext(own, p.pack)
+        near, far = self._near.value, self._far.value
+        s = p.multiply_add(p.subtract(far, near), own, near)
+        found = p.where(
+            hit, self.length(p.add(self.walk.start.value, p.minimum(p.maximum(s, near), far))), p.constant(float("inf"))
+        )
+        p.store_masked(found, p.advance(self.job.t, first, DOUBLE), real)
+
+
+class _Candidates(_Program):
+    """Every piece that may hold a hit is written down, as far as there is room; all are counted."""
+
+    def prepare(self) -> None:
+        self._none = ir.Constant(ir.VectorType(I64, self.lanes.count), [0] * self.lanes.count)
+        self._count = self.lanes.variable(self._none)
+
+    def begin(self) -> None:
+        self._count.value = self._none
+
+    def take(self, first: Value, piece: Piece) -> None:
+        e, b, walk = self.lanes, self.builder, self.walk
+        jump = self.jumps(piece)
+        holds = self.holds(piece, jump)
+        with b.if_then(e.any(holds)):
+            flags = self._flags(piece, jump)
+            places = [self.length(s) for s in (walk.start.value, piece.found.near, piece.found.far)]
+            for lane in range(e.count):
+                with b.if_then(e.lane(holds, lane)):
+                    self._write(first, lane, places, piece.rows, flags)
+            count = self._count.value
+            self._count.value = b.add(count, b.zext(holds, count.type))
+
+    def _flags(self, piece: Piece, jump: Value) -> Value:
+        e, b = self.lanes, self.builder
+        zero, kind = e.constant(0), ir.VectorType(I8, e.count)
+        on_it = b.and_(b.fcmp_ordered("==", piece.before, zero), b.fcmp_ordered("==", piece.rows[0], zero))
+        nothing, jumped, again = (ir.Constant(kind, [flag] * e.count) for flag in (0, JUMP, REPEATED))
+        return b.or_(b.select(jump, jumped, nothing), b.select(b.and_(piece.joined, on_it), again, nothing))
+
+    def _write(self, first: Value, lane: int, places: Sequence[Value], rows: Rows, flags: Value) -> None:
+        """One lane's piece, if there is room."""
+        e, b, j = self.lanes, self.builder, self.job
+        count = e.lane(self._count.value, lane)
+        with b.if_then(b.icmp_signed("<", count, j.capacity)):
+            index = b.add(b.mul(b.add(first, I64(lane)), j.capacity), count)
+            arrays = ((j.places, places, DOUBLE), (j.pieces, rows, self.number), (j.flags, [flags], I8))
+            for array, packs, kind in arrays:
+                for i, pack in enumerate(packs):
+                    place = e.advance(array, b.add(b.mul(index, I64(len(packs))), I64(i)), kind)
+                    b.store(e.lane(pack, lane), place)
+
+    def finish(self, first: Value, real: Value) -> None:
+        self.lanes.store_masked(self._count.value, self.lanes.advance(self.job.count, first, I64), real)

@@ -1,0 +1,45 @@
+"""Casting rays at a level: what runs it. Derivatives of hits are `surfaces.base`'s, once for all surfaces."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from filterlab.ops import cpu
+from filterlab.ops.differentiable.drivers import driver
+from filterlab.ops.differentiable.recording import transforming
+from filterlab.ops.raycast import Candidates, Raycast
+from filterlab.ops.stencil import Stencil
+
+
+def missing(given: Raycast, origins: Tensor) -> str | None:
+    """What keeps the program from running here as asked; None: nothing does."""
+    if transforming():
+        return "it has no transforms of torch.func"
+    lattice = given.lattice
+    if problem := cpu.missing(
+        lattice.coefficients.detach()[None, None], origins[None].to(given.dtype), Stencil((lattice.row,))
+    ):
+        return problem
+    if given.leaps.numel() >= 1 << 31:
+        return f"up to {1 << 31} bricks; got {given.leaps.numel()}"
+    return None
+
+
+def first(given: Raycast, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Tensor:
+    """t (R,) float64, where rays (R, 3) first meet the level; ∞ where they don't. Without derivatives.
+
+    Args:
+        implementation: "reference" or "cpu"; None: the fastest that can run.
+    """
+    return _driver(given, origins, implementation).first(given, origins, directions)
+
+
+def candidates(given: Raycast, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Candidates:
+    """The pieces of rays (R, 3) that may hold a crossing, those of a ray in order. Arguments as for `first`."""
+    return _driver(given, origins, implementation).candidates(given, origins, directions)
+
+
+def _driver(given: Raycast, origins: Tensor, implementation: str | None):
+    if implementation is None:
+        implementation = "cpu" if missing(given, origins) is None else "reference"
+    return driver(implementation, "raycast")

@@ -1,0 +1,84 @@
+"""Casting rays at a level in plain torch, from the pieces of whatever field.
+
+Pieces whose Bernstein coefficients lie on one side of the level hold no crossing; in the others the root search of
+`filterlab.roots` cannot miss one. Where a field jumps over the level between two pieces, that is a crossing too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from filterlab.ops.pieces import Pieces
+from filterlab.ops.raycast import Candidates, Raycast, joined
+from filterlab.ops.reference.pieces import pieces_of_rays
+from filterlab.roots import first_root
+
+PIECES_AT_ONCE = 1 << 19  # at most, of as many rays as may have so many
+
+Search = Callable[[Tensor, Tensor], Candidates]
+"""What is found along rays (R, 3)."""
+
+
+def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
+    """t (R,) float64, where rays (R, 3) first meet the level; ∞ where they don't."""
+    return first_of(_found(given), origins, directions, sum(given.lattice.cells))
+
+
+def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidates:
+    """The pieces of rays (R, 3) that may hold a crossing, ray by ray, in order."""
+    return all_of(_found(given), origins, directions, sum(given.lattice.cells))
+
+
+def _found(given: Raycast) -> Search:
+    return lambda origins, directions: candidates_of(_pieces(given, origins, directions), given.level)
+
+
+def _pieces(given: Raycast, origins: Tensor, directions: Tensor) -> Pieces:
+    """The pieces of rays (R, 3) in bricks that may hold the level."""
+    lattice = given.lattice
+    numbers = given.matrix, given.origin, lattice.offset
+    matrix, origin, offset = (torch.tensor(x, dtype=torch.float64, device=origins.device) for x in numbers)
+    own = (origins.double() - origin) @ matrix.T - offset, directions.double() @ matrix.T
+    return pieces_of_rays(own, lattice, given.dtype, given.edge, given.leaps == 0)
+
+
+def first_of(search: Search, origins: Tensor, directions: Tensor, most: int) -> Tensor:
+    """t (R,) of the first crossing among what a search finds, ∞ where none; `most` pieces, about, has a ray."""
+    t = origins.new_full((len(origins),), math.inf, dtype=torch.float64)
+    for part in _parts(len(origins), most):
+        found = search(origins[part], directions[part])
+        within = torch.where(found.jump, 0, first_root(found.coefficients))
+        t[part] = t[part].scatter_reduce(0, found.ray, found.t(within), "amin")
+    return t
+
+
+def all_of(search: Search, origins: Tensor, directions: Tensor, most: int) -> Candidates:
+    """All that a search finds."""
+    parts = []
+    for part in _parts(len(origins), most):
+        found = search(origins[part], directions[part])
+        parts.append(found._replace(ray=found.ray + part.start))
+    return joined(parts)
+
+
+def _parts(rays: int, most: int) -> list[slice]:
+    """Rays at a time, so that memory does not grow with their number."""
+    step = max(1, PIECES_AT_ONCE // (most + 3))
+    return [slice(first, first + step) for first in range(0, rays, step)] or [slice(0, 0)]
+
+
+def candidates_of(pieces: Pieces, level: float) -> Candidates:
+    """Those of some pieces that may hold a crossing."""
+    c = pieces.coefficients - level
+    low, high = c.aminmax(dim=-1) if len(c) else (c[:, 0], c[:, 0])
+    jump, repeated = torch.zeros_like(pieces.ray, dtype=torch.bool), torch.zeros_like(pieces.ray, dtype=torch.bool)
+    joined, before, after = pieces.joined[1:], c[:-1, -1], c[1:, 0]
+    jump[1:] = joined & (before.sign() * after.sign() < 0)
+    repeated[1:] = joined & (before == 0) & (after == 0)
+    keep = ((low <= 0) & (high >= 0)) | jump
+    rows = (pieces.ray, pieces.start[pieces.ray], pieces.near, pieces.far, c, jump, repeated)
+    return Candidates(*(row[keep] for row in rows))

@@ -1,0 +1,140 @@
+"""The program that casts rays against its plain twin: the same hits, the same pieces."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+import filterlab as fl
+from filterlab.fields.grid import GridField
+from filterlab.kernels import KERNELS
+from filterlab.methods import METHODS, from_kernel
+from filterlab.ops import cpu
+from filterlab.ops.differentiable import raycast
+from filterlab.ops.raycast import Raycast, leaps_of
+
+AFFINE = [[1.5, 0.2, 0.1, 3.0], [0.0, -0.8, 0.3, -2.0], [0.1, 0.0, 2.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
+LEVEL = 0.5
+
+
+def samples(seed: int = 0, shape: tuple[int, int, int] = (9, 8, 7)) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def rays(field: GridField, count: int = 203, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    g = torch.Generator().manual_seed(1)
+    inside = torch.rand(count, 3, generator=g, dtype=torch.float64) * 6
+    directions = torch.randn(count, 3, generator=g, dtype=torch.float64)
+    directions[::7, 0] = 0  # within planes, along axes, and away from the volume
+    directions[::14, 1:] = torch.tensor([0.0, -2.0])
+    geometry = field.domain.geometry
+    origins = geometry.to_world(inside - 20 * directions * (torch.arange(count) % 3 > 0)[:, None])
+    ways = geometry.to_world(directions) - geometry.to_world(torch.zeros_like(directions))
+    return origins.to(dtype), ways.to(dtype)
+
+
+def described(field: GridField, dtype: torch.dtype = torch.float64) -> Raycast:
+    o, d = rays(field, 1, dtype)
+    return field._raycast(LEVEL, o, d)
+
+
+def assert_alike(field: GridField, tolerance: float = 1e-12) -> None:
+    given, (o, d) = described(field), rays(field)
+    assert raycast.missing(given, o) is None
+    expected, found = (raycast.first(given, o, d, way) for way in ("reference", "cpu"))
+    assert 0.2 < (expected < torch.inf).double().mean() < 1
+    assert torch.equal(expected < torch.inf, found < torch.inf)
+    hit = expected < torch.inf
+    assert float((expected - found)[hit].abs().max()) <= tolerance
+    all_, mine = (raycast.candidates(given, o, d, way) for way in ("reference", "cpu"))
+    order = mine.ray.argsort(stable=True)  # those with many come later
+    assert torch.equal(mine.ray[order], all_.ray)
+    for name in ("start", "near", "far", "coefficients"):
+        difference = getattr(mine, name)[order] - getattr(all_, name)
+        assert float(difference.abs().max()) <= tolerance, name
+    for name in ("jump", "repeated"):
+        assert torch.equal(getattr(mine, name)[order], getattr(all_, name)), name
+
+
+@pytest.mark.parametrize("boundary", ["mirror", "zeros"])
+@pytest.mark.parametrize("method", METHODS)
+def test_the_same_hits_and_pieces(method, boundary):
+    assert_alike(fl.reconstruct(fl.Volume(samples(), affine=AFFINE), method, boundary=boundary))
+
+
+@pytest.mark.parametrize("name", [name for name, kernel in KERNELS.items() if kernel.degree <= 3])
+def test_every_kernel(name):
+    """Those that jump as well: there every cell is looked into."""
+    assert_alike(fl.reconstruct(samples(), from_kernel(KERNELS[name]), prefilter=False))
+
+
+@pytest.mark.parametrize("storage", ["float16", "bfloat16", "float32", "int16", "uint8"])
+def test_storage(storage):
+    assert_alike(fl.reconstruct(samples(), "triquadratic", storage=storage))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_float32_is_rounded_only(method):
+    field = fl.reconstruct(samples(), method)
+    o, d = rays(field, 2000, torch.float32)
+    exact = raycast.first(described(field), o.double(), d.double(), "cpu")
+    found = raycast.first(described(field, torch.float32), o, d, "cpu")
+    plain = raycast.first(described(field, torch.float32), o, d, "reference")
+    for other in (exact, plain):
+        assert float(((other < torch.inf) == (found < torch.inf)).double().mean()) > 0.998
+        same = (other - found).abs() < 1e-4
+        assert float(same[(other < torch.inf) & (found < torch.inf)].double().mean()) > 0.998
+
+
+def test_many_pieces_of_a_ray_are_cast_again(monkeypatch):
+    """Eight of one ray find room at first, then eight times as many, and none is lost or told twice."""
+    field = fl.reconstruct(samples(3, (5, 5, 90)), "trilinear")
+    o = torch.tensor([[-2.0, 2.3, 1.7], [200.0, 0.0, 0.0], [92.0, 1.2, 3.1]], dtype=torch.float64)
+    d = torch.tensor([[1.0, 0.01, 0.0], [1.0, 0.0, 0.0], [-1.0, 0.0, 0.004]], dtype=torch.float64)
+    all_, mine = (raycast.candidates(described(field), o, d, way) for way in ("reference", "cpu"))
+    assert (all_.ray == 0).sum() > 32
+    order = mine.ray.argsort(stable=True)
+    assert torch.equal(mine.ray[order], all_.ray)
+    assert torch.allclose(mine.near[order], all_.near, rtol=0, atol=1e-12)
+
+
+def test_threads_change_no_bit(monkeypatch):
+    field = fl.reconstruct(samples(), "triquadratic")
+    o, d = rays(field, 3000)
+    results = []
+    for threads in (1, 2, 3):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        results.append(raycast.first(described(field), o, d, "cpu"))
+    assert torch.equal(results[0], results[1])
+    assert torch.equal(results[0], results[2])
+
+
+def test_a_ray_is_what_it_is_in_any_company():
+    field = fl.reconstruct(samples(), "tricubic")
+    o, d = rays(field, 40)
+    together = raycast.first(described(field), o, d, "cpu")
+    alone = torch.cat([raycast.first(described(field), o[i : i + 1], d[i : i + 1], "cpu") for i in range(40)])
+    assert torch.equal(together, alone)
+
+
+def test_what_cannot_run_is_said_and_runs_plainly(monkeypatch):
+    field = fl.reconstruct(samples(), "triquadratic")
+    o, d = rays(field)
+    expected = raycast.first(described(field), o, d, "reference")
+    monkeypatch.setattr(cpu, "llvmlite_problem", lambda: "no llvmlite")
+    assert raycast.missing(described(field), o) == "no llvmlite"
+    assert torch.equal(raycast.first(described(field), o, d), expected)
+    plain = fl.reconstruct(samples(), "triquadratic", scheme="direct").first_crossing(o, d, LEVEL)
+    assert torch.allclose(plain, expected, rtol=0, atol=1e-12)  # its prefilter is another one
+
+
+def test_leaps_are_the_widest_cubes_that_hold_nothing():
+    g = torch.Generator().manual_seed(0)
+    relevant = torch.rand(21, 6, 37, generator=g) < 0.002
+    leaps = leaps_of(relevant, 4)
+    assert set(leaps.unique().tolist()) == {0, 2, 4, 6}
+    for z, y, x in torch.randint(0, 1 << 30, (300, 3), generator=g).remainder(torch.tensor(relevant.shape)).tolist():
+        empty = [not relevant[tuple(slice(i // n * n, i // n * n + n) for i in (z, y, x))].any() for n in (1, 4, 16)]
+        expected = 0 if not empty[0] else 2 + 2 * sum(empty[1:])
+        assert leaps[z, y, x] == expected
