@@ -314,7 +314,7 @@ class GridField(Field):
         lattice, geometry = self.lattice, self.domain.geometry
         bounds = ranges(lattice)
         return Raycast(
-            lattice, geometry.origin, geometry.inverse, level, dtype, bounds.leaps(level, dtype), bounds.edge
+            lattice, geometry.origin, geometry.inverse, level, dtype, bounds.clear(level, dtype), bounds.edge
         )
 
     @property

@@ -13,6 +13,7 @@ finite has NaN for bounds, and may hold anything.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -22,10 +23,10 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from filterlab import bernstein
 from filterlab.ops.pieces import Lattice
-from filterlab.ops.raycast import leaps_of
+from filterlab.ops.raycast import clear_of
 from filterlab.ops.stencil import Product
 
-EDGE = 4  # cells along an edge of a brick
+_MANY = 1 << 25  # cells from which on bricks have edges of 4, not 2
 _ROUNDING = 64  # units of rounding that a sum of taps may lose, relative to Σ |w| · max |c|
 
 
@@ -45,7 +46,7 @@ class Ranges:
     largest: float
     edge: int
     continuous: bool = True
-    _leaps: dict[tuple[float, torch.dtype], Tensor] = field(default_factory=dict, repr=False, compare=False)
+    _clear: dict[tuple[float, torch.dtype], Tensor] = field(default_factory=dict, repr=False, compare=False)
 
     def may_hold(self, level: float, dtype: torch.dtype) -> Tensor:
         """Which bricks may hold the level, (bz, by, bx), where values are computed in a dtype."""
@@ -54,13 +55,13 @@ class Ranges:
         margin = _ROUNDING * torch.finfo(dtype).eps * self.largest
         return ~((self.low > level + margin) | (self.high < level - margin))
 
-    def leaps(self, level: float, dtype: torch.dtype) -> Tensor:
-        """`ops.raycast.leaps_of` the same; the last one asked for is kept."""
-        found = self._leaps.get((level, dtype))
+    def clear(self, level: float, dtype: torch.dtype) -> Tensor:
+        """`ops.raycast.clear_of` the same; the last one asked for is kept."""
+        found = self._clear.get((level, dtype))
         if found is None:
-            found = leaps_of(self.may_hold(level, dtype), self.edge)
-            self._leaps.clear()
-            self._leaps[level, dtype] = found
+            found = clear_of(self.may_hold(level, dtype))
+            self._clear.clear()
+            self._clear[level, dtype] = found
         return found
 
 
@@ -68,12 +69,21 @@ _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 """Of coefficients that are still alive: {what was asked of them: (their version, ranges)}."""
 
 
-def ranges(lattice: Lattice, edge: int = EDGE) -> Ranges:
+def edge_for(lattice: Lattice) -> int:
+    """Cells along an edge of a brick: bounds take 2 bytes a cell, or, of large volumes, ¼.
+
+    Measured: with edges of 2 rays look into half as many cells as with 4, and take 0.85 of the time (Marschner-Lobb
+    128³, trilinear to tricubic).
+    """
+    return 2 if math.prod(lattice.cells) < _MANY else 4
+
+
+def ranges(lattice: Lattice, edge: int | None = None) -> Ranges:
     """Bounds of every brick; kept for as long as the coefficients are, and made anew after they were written to.
 
     Made anew every time for kernels that are tensors: these may change too.
     """
-    grid = lattice.coefficients.detach()
+    grid, edge = lattice.coefficients.detach(), edge or edge_for(lattice)
     if grid.is_inference() or not lattice.exact:  # the former don't count how often they are written to
         return _made(lattice, edge)
     base = lattice.coefficients._base

@@ -20,7 +20,7 @@ from filterlab.ops.pieces import Lattice, Triple
 
 MAX_DEGREE = 9  # along a ray
 
-_CUBES = (4, 16)  # bricks along an edge of what is leapt over at once, besides one
+_RADII = (1, 2, 4, 8)  # bricks around an empty one that are told to be empty as well
 
 
 class Candidates(NamedTuple):
@@ -62,8 +62,8 @@ class Raycast:
         origin, matrix: coordinates of cells are matrix · (world − origin) − lattice.offset.
         level: f = level is what is hit.
         dtype: of the rays and of polynomials, float32 or float64.
-        leaps: (bz, by, bx) uint8, by bricks of `edge`³ cells: log₂ of the edge of a cube of cells around the brick that
-            does not hold the level; 0: the brick may.
+        clear: (bz, by, bx) uint8, of bricks of `edge`³ cells: 0 where the brick may hold the level, else 1 + r, where
+            no brick within r of it, along every axis, does.
         edge: cells along an edge of a brick, a power of two.
     """
 
@@ -72,26 +72,26 @@ class Raycast:
     matrix: tuple[Triple, ...]
     level: float
     dtype: torch.dtype
-    leaps: Tensor
+    clear: Tensor
     edge: int
 
 
-def leaps_of(relevant: Tensor, edge: int) -> Tensor:
-    """`Raycast.leaps`, by cubes of 1, 4 and 16 bricks along an edge, from (bz, by, bx) which may hold the level."""
-    leaps = torch.full_like(relevant, edge.bit_length() - 1, dtype=torch.uint8)
-    leaps[relevant] = 0
-    pooled = relevant
-    for bricks in _CUBES:
-        pooled = _any_of_four(_any_of_four(_any_of_four(pooled, 0), 1), 2)
-        wide = pooled
-        for dim, size in enumerate(relevant.shape):
-            wide = wide.repeat_interleave(bricks, dim).narrow(dim, 0, size)
-        leaps.masked_fill_(~wide, (edge * bricks).bit_length() - 1)
-    return leaps
+def clear_of(relevant: Tensor) -> Tensor:
+    """`Raycast.clear` from (bz, by, bx) which bricks may hold the level, for r of `_RADII`."""
+    near = relevant.to(torch.uint8)
+    clear, reach = 1 - near, 0
+    for radius in _RADII:  # within 2 k is within k of what is within k
+        for dim in range(3):
+            near = _spread(near, dim, radius - reach)
+        clear += (1 - near) * (radius - reach)
+        reach = radius
+    return clear
 
 
-def _any_of_four(mask: Tensor, dim: int) -> Tensor:
-    """Whether one of four neighbours along an axis has it."""
-    more = -mask.shape[dim] % 4
-    pad = [0, 0] * (mask.ndim - 1 - dim) + [0, more]
-    return torch.nn.functional.pad(mask, pad).unflatten(dim, (-1, 4)).any(dim + 1)
+def _spread(mask: Tensor, dim: int, by: int) -> Tensor:
+    """Where it is 1, or was so many places before or behind along an axis."""
+    out, kept = mask.clone(), mask.shape[dim] - by
+    if kept > 0:
+        out.narrow(dim, by, kept).bitwise_or_(mask.narrow(dim, 0, kept))
+        out.narrow(dim, 0, kept).bitwise_or_(mask.narrow(dim, by, kept))
+    return out

@@ -12,7 +12,7 @@ from filterlab.kernels import KERNELS
 from filterlab.methods import METHODS, from_kernel
 from filterlab.ops import cpu
 from filterlab.ops.differentiable import raycast
-from filterlab.ops.raycast import Raycast, leaps_of
+from filterlab.ops.raycast import Raycast, clear_of
 
 AFFINE = [[1.5, 0.2, 0.1, 3.0], [0.0, -0.8, 0.3, -2.0], [0.1, 0.0, 2.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
 LEVEL = 0.5
@@ -129,12 +129,13 @@ def test_what_cannot_run_is_said_and_runs_plainly(monkeypatch):
     assert torch.allclose(plain, expected, rtol=0, atol=1e-12)  # its prefilter is another one
 
 
-def test_leaps_are_the_widest_cubes_that_hold_nothing():
+def test_clear_bricks_are_as_far_from_the_others_as_is_said():
     g = torch.Generator().manual_seed(0)
-    relevant = torch.rand(21, 6, 37, generator=g) < 0.002
-    leaps = leaps_of(relevant, 4)
-    assert set(leaps.unique().tolist()) == {0, 2, 4, 6}
-    for z, y, x in torch.randint(0, 1 << 30, (300, 3), generator=g).remainder(torch.tensor(relevant.shape)).tolist():
-        empty = [not relevant[tuple(slice(i // n * n, i // n * n + n) for i in (z, y, x))].any() for n in (1, 4, 16)]
-        expected = 0 if not empty[0] else 2 + 2 * sum(empty[1:])
-        assert leaps[z, y, x] == expected
+    relevant = torch.rand(21, 6, 47, generator=g) < 0.001
+    clear = clear_of(relevant)
+    assert set(clear.unique().tolist()) == {0, 1, 2, 3, 5, 9}
+    where = relevant.nonzero()
+    for brick in torch.randint(0, 1 << 30, (400, 3), generator=g).remainder(torch.tensor(relevant.shape)):
+        distance = int((where - brick).abs().amax(1).min())
+        expected = max((1 + r for r in (0, 1, 2, 4, 8) if r < distance), default=0)
+        assert clear[tuple(brick)] == expected

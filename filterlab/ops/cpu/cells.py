@@ -1,9 +1,9 @@
 """The way of rays through the cells of a lattice, a pack of rays at a time; what surely holds nothing is leapt over.
 
-Every ray has a cell and a place s on it. Its next cell is behind the nearest of three planes, those of its cell or, in
-a brick whose bounds leave out the level, those of the cube around it that does as well (`ops.raycast.leaps_of`). Where
-a ray crosses a plane is (plane − o) / d, whoever asks, so that neighbours share their ends to the bit; through edges
-and corners cells follow one another by faces, some of them over no length.
+Every ray has a cell and a place s. Its next cell is behind the nearest of three planes, those of its cell or, in a
+brick whose bounds leave out the level, those of the cube of clear bricks around it (`ops.raycast.clear_of`). Where a
+ray crosses a plane is (plane − o) / d, whoever asks, so that neighbours share their ends to the bit; through edges and
+corners cells follow one another by faces, some of them over no length.
 
 Places are doubles, whatever polynomials are computed in. A ray is measured from where it enters the domain, and its
 direction scaled by a power of two to a length about 1. Who has found a cell that may hold the level waits for the
@@ -57,10 +57,9 @@ class Walk:
         doubles, cells = (lambda: lanes.variable(nothing)), (lambda: lanes.variable(zero))
         self.entry, self.direction = [doubles() for _ in AXES], [doubles() for _ in AXES]
         self._from, self._inverse = [doubles() for _ in AXES], [doubles() for _ in AXES]
-        self._forward = [lanes.variable(never) for _ in AXES]
+        self._backward = [cells() for _ in AXES]  # −1 where rays go backward, else 0
         self.start, self.scale, self._s, self._end = doubles(), doubles(), doubles(), doubles()
-        self._near, self._far = doubles(), doubles()
-        self._cell, self._own = [cells() for _ in AXES], [cells() for _ in AXES]
+        self._cell = [cells() for _ in AXES]
         self.going = lanes.variable(never)
 
     def mask(self, value: bool) -> Value:
@@ -94,7 +93,7 @@ class Walk:
             last = e.minimum(e.where(still[i], e.where(within, never, always), e.maximum(a, z)), last)
             moving.append(e.where(still[i], e.constant(0), d))
             self._inverse[i].value = e.divide(e.constant(1), speed)
-            self._forward[i].value = b.fcmp_ordered(">=", speed, e.constant(0))
+            self._backward[i].value = self._wide(b.fcmp_ordered("<", speed, e.constant(0)))
         met = b.and_(real, b.fcmp_ordered("<=", first, last))
         self.going.value = met
         self.start.value = first = e.where(met, first, e.constant(0))
@@ -148,68 +147,117 @@ class Walk:
     def next_cells(self, waiting: Value) -> Found:
         """Let all rays but those that wait go on, until each has come to a cell that may hold the level, or to its end.
 
-        A ray ends with `going`; the cell that it ends in may be found as well.
+        A ray is then behind the cell that was found. `going` ends with the ray; that it may do in the cell.
         """
         e, b = self.lanes, self.builder
-        searching = e.variable(b.and_(self.going.value, b.not_(waiting)))
-        found = e.variable(self.mask(False))
-        with e.repeat_while(lambda: e.any(searching.value)):
-            self._step(searching, found)
-        return Found(found.value, [c.value for c in self._own], self._near.value, self._far.value)
+        searching = b.and_(self.going.value, b.not_(waiting))
+        on, found = e.variable(self._wide(searching)), e.variable(self._integers(0))
+        clear = e.variable(self._integers(0))
+        self._look(on, found, clear)
+        with e.repeat_while(lambda: e.any(self._narrow(on.value))):
+            self._leap(on, clear.value)
+            self._look(on, found, clear)
+        mask = self._narrow(found.value)
+        cell = [b.select(mask, c.value, self._integers(0)) for c in self._cell]  # taps are read in every lane
+        ahead = [b.add(c, self._sign(f, 0)) for c, f in zip(cell, self._backward, strict=True)]
+        near, end = self._s.value, self._end.value
+        crossed = self._crossed(ahead)
+        far = e.maximum(self._least(crossed), near)
+        over = b.fcmp_unordered(">=", far, end)
+        through = self._through(crossed)
+        beyond = [b.add(p, back.value) for p, back in zip(ahead, self._backward, strict=True)]
+        outside = self._outside([b.select(t, x, c) for t, x, c in zip(through, beyond, cell, strict=True)])
+        for own, t, x, c in zip(self._cell, through, beyond, cell, strict=True):
+            own.value = b.select(mask, b.select(t, x, c), own.value)
+        self._s.value = e.where(mask, far, near)
+        self.going.value = b.and_(self.going.value, b.not_(b.and_(mask, b.or_(over, outside))))
+        return Found(mask, cell, near, e.minimum(far, end))
 
-    def _step(self, searching: Variable, found: Variable) -> None:
+    def _look(self, on: Variable, found: Variable, clear: Variable) -> None:
+        """Whoever is in a brick that may hold the level has found its cell."""
+        b = self.builder
+        edge = self._whole(self.job.edge)
+        clear.value = seen = self._clear([b.lshr(c.value, edge) for c in self._cell])
+        holds = b.and_(on.value, self._wide(b.icmp_signed("==", seen, self._integers(0))))
+        found.value = b.or_(found.value, holds)
+        on.value = b.xor(on.value, holds)
+
+    def _leap(self, on: Variable, clear: Value) -> None:
+        """Over the clear bricks around."""
         e, b = self.lanes, self.builder
-        on = searching.value
+        moves = self._narrow(on.value)
+        edge, radius = self._whole(self.job.edge), b.sub(clear, self._integers(1))
         cell = [c.value for c in self._cell]
-        leap = self._leaps(cell)
-        one = ir.Constant(self.integers, [1] * e.count)
-        width = b.shl(one, leap)
-        forward = [f.value for f in self._forward]
-        low = [b.shl(b.lshr(c, leap), leap) for c in cell]
-        plane = [b.select(f, b.add(x, width), x) for f, x in zip(forward, low, strict=True)]
-        crossed = [
-            e.multiply(e.subtract(self._as_double(p), o.value), inverse.value)
+        brick = [b.lshr(c, edge) for c in cell]
+        plane = [b.shl(b.add(x, self._sign(f, radius)), edge) for x, f in zip(brick, self._backward, strict=True)]
+        crossed = self._crossed(plane)
+        before = self._s.value
+        reached = e.maximum(self._least(crossed), before)
+        cells = []
+        for i, through in enumerate(self._through(crossed)):
+            at = e.to_integer(e.floor(e.multiply_add(reached, self.direction[i].value, self.entry[i].value)))
+            low = b.shl(b.sub(brick[i], radius), edge)
+            high = b.sub(b.shl(b.add(brick[i], clear), edge), self._integers(1))
+            at = self._smaller(self._larger(at, low), high)
+            cells.append(b.select(through, b.add(plane[i], self._backward[i].value), at))
+            self._cell[i].value = b.select(moves, cells[i], cell[i])
+        self._s.value = e.where(moves, reached, before)
+        ended = b.or_(b.fcmp_unordered(">=", reached, self._end.value), self._outside(cells))
+        ended = b.and_(moves, ended)
+        self.going.value = b.and_(self.going.value, b.not_(ended))
+        on.value = self._wide(b.and_(moves, b.not_(ended)))
+
+    def _crossed(self, plane: Sequence[Value]) -> list[Value]:
+        """Where rays cross planes across x, y and z; at infinity where they don't move along an axis."""
+        e = self.lanes
+        return [
+            e.multiply(e.subtract(self.builder.sitofp(p, e.pack), o.value), inverse.value)
             for p, o, inverse in zip(plane, self._from, self._inverse, strict=True)
         ]
-        nearest = e.minimum(e.minimum(*crossed[:2]), crossed[2])
-        s = self._s.value
-        reached = e.maximum(nearest, s)
-        through = [b.fcmp_ordered("<=", crossed[0], nearest)]
-        through.append(b.and_(b.not_(through[0]), b.fcmp_ordered("<=", crossed[1], nearest)))
-        through.append(b.not_(b.or_(*through)))
-        end = self._end.value
-        holds = b.and_(on, b.icmp_signed("==", leap, ir.Constant(self.integers, [0] * e.count)))
-        over = b.fcmp_unordered(">=", reached, end)
-        self._near.value = e.where(holds, s, self._near.value)
-        self._far.value = e.where(holds, e.minimum(reached, end), self._far.value)
-        outside = self.mask(False)
-        for i in range(3):
-            self._own[i].value = b.select(holds, cell[i], self._own[i].value)
-            beyond = b.select(forward[i], plane[i], b.sub(plane[i], one))
-            outside = b.or_(outside, b.and_(through[i], self._outside(beyond, i)))
-            at = e.to_integer(e.floor(e.multiply_add(reached, self.direction[i].value, self.entry[i].value)))
-            at = self._smaller(self._larger(at, low[i]), b.sub(b.add(low[i], width), one))
-            self._cell[i].value = b.select(on, self._bounded(b.select(through[i], beyond, at), i), cell[i])
-        self._s.value = e.where(on, reached, s)
-        ended = b.and_(on, b.or_(over, outside))
-        self.going.value = b.and_(self.going.value, b.not_(ended))
-        found.value = b.or_(found.value, holds)
-        searching.value = b.and_(on, b.not_(b.or_(holds, ended)))
 
-    def _outside(self, cell: Value, axis: int) -> Value:
-        return self.builder.icmp_unsigned(">", cell, self._last(axis))
+    def _least(self, crossed: Sequence[Value]) -> Value:
+        return self.lanes.minimum(self.lanes.minimum(*crossed[:2]), crossed[2])
 
-    def _as_double(self, whole: Value) -> Value:
-        return self.builder.sitofp(whole, self.lanes.pack)
+    def _through(self, crossed: Sequence[Value]) -> list[Value]:
+        """Masks: which of the planes is the nearest one; where several are, the first of them."""
+        b, (x, y, z) = self.builder, crossed
+        first = b.and_(b.fcmp_ordered("<=", x, y), b.fcmp_ordered("<=", x, z))
+        second = b.and_(b.not_(first), b.fcmp_ordered("<=", y, z))
+        return [first, second, b.not_(b.or_(first, second))]
 
-    def _leaps(self, cell: list[Value]) -> Value:
-        """log₂ of the edge of the cube that may be leapt over; 0 in a brick that may hold the level."""
+    def _sign(self, backward: Variable, radius: Value | int) -> Value:
+        """1 + r for a ray that goes forward, −r for one that goes backward: bricks to the plane ahead."""
+        b = self.builder
+        flipped = b.xor(backward.value, radius) if radius else backward.value
+        return b.add(flipped, self._integers(1))
+
+    def _outside(self, cell: Sequence[Value]) -> Value:
+        """A mask of cells beyond the lattice."""
+        b, out = self.builder, self.mask(False)
+        for i, own in enumerate(cell):
+            out = b.or_(out, b.icmp_unsigned(">", own, self._last(i)))
+        return out
+
+    def _integers(self, value: int) -> Value:
+        return ir.Constant(self.integers, [value] * self.lanes.count)
+
+    def _wide(self, mask: Value) -> Value:
+        """A mask as integers of 32 bits, −1 for true, which are kept in registers."""
+        return self.builder.sext(mask, self.integers)
+
+    def _narrow(self, mask: Value) -> Value:
+        return self.builder.icmp_signed("<", mask, self._integers(0))
+
+    def _clear(self, brick: Sequence[Value]) -> Value:
+        """`Raycast.clear` of bricks; whatever, but in memory, beyond the lattice."""
         e, b, j = self.lanes, self.builder, self.job
-        x, y, z = (b.lshr(c, self._whole(j.edge)) for c in cell)
-        bx, by = (self._whole(n) for n in (j.bricks_x, j.bricks_y))
+        x, y, z = brick
+        bx, by, bz = (self._whole(n) for n in (j.bricks_x, j.bricks_y, j.bricks_z))
+        last = b.sub(b.mul(b.mul(bz, by), bx), self._integers(1))
         index = b.add(b.mul(b.add(b.mul(z, by), y), bx), x)
+        index = b.select(b.icmp_unsigned("<", index, last), index, last)
         found = ir.Constant(ir.VectorType(I8, e.count), [0] * e.count)
         for lane in range(e.count):
             place = b.zext(b.extract_element(index, I32(lane)), I64)
-            found = b.insert_element(found, b.load(e.advance(j.leaps, place, I8), typ=I8), I32(lane))
+            found = b.insert_element(found, b.load(e.advance(j.clear, place, I8), typ=I8), I32(lane))
         return b.zext(found, self.integers)

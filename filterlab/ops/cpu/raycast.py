@@ -74,7 +74,7 @@ class _Cast:
             shift=lattice.shift - given.level,
             edge=given.edge.bit_length() - 1,
         )
-        for axis, cells, bricks in zip(AXES, lattice.cells, given.leaps.shape[::-1], strict=True):
+        for axis, cells, bricks in zip(AXES, lattice.cells, given.clear.shape[::-1], strict=True):
             setattr(self.job, f"cells_{axis}", cells)
             setattr(self.job, f"bricks_{axis}", bricks)
         numbers = {"origin": given.origin, "offset": lattice.offset, "lower": lattice.lower, "upper": lattice.upper}
@@ -84,7 +84,7 @@ class _Cast:
             origins=origins.to(given.dtype).contiguous(),
             directions=directions.to(given.dtype).contiguous(),
             matrix=torch.tensor(given.matrix, dtype=torch.float64),
-            leaps=given.leaps.contiguous(),
+            clear=given.clear.contiguous(),
             **arrays,
         )
 

@@ -20,8 +20,8 @@ def missing(given: Raycast, origins: Tensor) -> str | None:
         lattice.coefficients.detach()[None, None], origins[None].to(given.dtype), Stencil((lattice.row,))
     ):
         return problem
-    if given.leaps.numel() >= 1 << 31:
-        return f"up to {1 << 31} bricks; got {given.leaps.numel()}"
+    if given.clear.numel() >= 1 << 31:
+        return f"up to {1 << 31} bricks; got {given.clear.numel()}"
     return None
 
 

@@ -43,7 +43,7 @@ def _pieces(given: Raycast, origins: Tensor, directions: Tensor) -> Pieces:
     numbers = given.matrix, given.origin, lattice.offset
     matrix, origin, offset = (torch.tensor(x, dtype=torch.float64, device=origins.device) for x in numbers)
     own = (origins.double() - origin) @ matrix.T - offset, directions.double() @ matrix.T
-    return pieces_of_rays(own, lattice, given.dtype, given.edge, given.leaps == 0)
+    return pieces_of_rays(own, lattice, given.dtype, given.edge, given.clear == 0)
 
 
 def first_of(search: Search, origins: Tensor, directions: Tensor, most: int) -> Tensor:
