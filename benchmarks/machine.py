@@ -16,7 +16,7 @@ from benchmarks.records import Machine
 from filterlab.ops.cpu.compiler import features
 
 _TOLD = ("sse4.2", "avx", "avx2", "fma", "f16c", "avx512f", "avx512vl", "avx512bw", "avx512dq", "neon", "sve")
-_PACKAGES = ("filterlab", "torch", "numpy", "llvmlite", "scipy", "torch-interpol", "drjit", "vtk")
+_PACKAGES = ("filterlab", "torch", "numpy", "llvmlite", "scipy", "torch-interpol", "drjit", "mitsuba", "embreex", "vtk")
 _ABSENT = "not installed"
 _OF_GPU = ("triton", "cupy-cuda12x", "cupy-cuda13x")
 

@@ -8,7 +8,20 @@ from importlib import import_module
 from benchmarks.harness import Comparison, Item
 from benchmarks.settings import Settings
 
-_NAMES = ("floor", "jets", "derivatives", "peers", "prefilter", "roots", "dvr", "absent", "scaling", "startup", "gpu")
+_NAMES = (
+    "floor",
+    "jets",
+    "derivatives",
+    "peers",
+    "prefilter",
+    "roots",
+    "dvr",
+    "surfaces",
+    "absent",
+    "scaling",
+    "startup",
+    "gpu",
+)
 
 COMPARISONS: dict[str, Comparison] = {
     name: import_module(f"benchmarks.comparisons.{name}").COMPARISON for name in _NAMES

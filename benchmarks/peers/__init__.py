@@ -1,8 +1,9 @@
 """Other libraries that do some of the same, each in a file of its own; those that are not installed are left out.
 
 A module here has `NAME`, `missing()` (why it can't take part; None: it can) and one of these: `sampling(task)`, the
-contestant for a `Sampling`, with `offers(kernel, gradient)`, or `marching(scene)`, the contestant that renders a
-`Scene`. Points, coefficients and tables are handed over in the library's own form before anything is timed.
+contestant for a `Sampling`, with `offers(kernel, gradient)`; `marching(scene)`, the contestant that renders a `Scene`;
+`casting(task)`, the one that casts the rays of a `Casting`. Points, coefficients and tables are handed over in the
+library's own form before anything is timed.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ _NAMES = (
     "drjit_triquadratic",
     "drjit_march",
     "vtk_raycaster",
+    "mitsuba_sdfgrid",
+    "embree_mesh",
 )
 
 PEERS: tuple[ModuleType, ...] = tuple(import_module(f"benchmarks.peers.{name}") for name in _NAMES)

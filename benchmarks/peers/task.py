@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.util import find_spec
 
+import numpy as np
 from torch import Tensor
 
 
@@ -29,6 +30,31 @@ class Sampling:
     @property
     def computes(self) -> str:
         return "value and gradient" if self.gradient else "value"
+
+
+@dataclass(frozen=True)
+class Casting:
+    """What is asked of whoever casts rays at a level set.
+
+    Attributes:
+        volume: (n, n, n) float32, samples at the integers.
+        level: f = level is hit.
+        origins, directions: (R, 3) float32 voxel coordinates x, y, z.
+        threads: how many it may use.
+    """
+
+    volume: Tensor
+    level: float
+    origins: Tensor
+    directions: Tensor
+    threads: int
+    computes: str = "trilinear hits"
+
+    @staticmethod
+    def summary(t: np.ndarray) -> tuple[np.ndarray, ...]:
+        """How many hits, and how far away in the mean: rays that graze the surface may be judged either way."""
+        hit = np.isfinite(t)
+        return np.array([hit.mean()]), np.array([t[hit].mean()])
 
 
 def without(package: str, install: str | None = None) -> str | None:

@@ -175,6 +175,15 @@ class Field(ABC):
         center = torch.tensor([self.domain.center], dtype=torch.float64, device=self.device)
         return self.jet(center if self.channels is None else center[None], 0)[0].requires_grad
 
+    @property
+    def tensors(self) -> tuple[Tensor, ...] | None:
+        """All numbers that it is made of and may have derivatives by; None: it cannot tell."""
+        return None
+
+    def with_tensors(self, tensors: Sequence[Tensor]) -> Field:
+        """The same field, made of others in place of `tensors`."""
+        raise TypeError(f"{type(self).__name__} ({self.scheme.name}) cannot tell its tensors")
+
     def detached(self) -> Field:
         """The same field, by whose own numbers no derivatives are asked; itself where it cannot tell them apart."""
         return self

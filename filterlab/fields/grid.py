@@ -18,7 +18,7 @@ from torch import Tensor
 from filterlab.fields.base import Domain, Field, Relevant, check_order, check_points
 from filterlab.fields.ranges import ranges, straddling
 from filterlab.fields.storage import Quantization, stored_as
-from filterlab.kernels import Factor, PiecewisePolynomial
+from filterlab.kernels import Factor, Kernel, PiecewisePolynomial
 from filterlab.ops.differentiable import raycast as casting
 from filterlab.ops.differentiable.prefilter import implementation_for, prefilter_samples
 from filterlab.ops.pieces import Lattice, Pieces
@@ -269,11 +269,19 @@ class GridField(Field):
         one._settle()
         return one
 
+    @property
+    def tensors(self) -> tuple[Tensor, ...] | None:
+        """The coefficients; None where kernels are tensors too."""
+        exact = all(isinstance(k, Kernel) for term in self.scheme.terms for k in term.kernels)
+        return (self.coefficients.values,) if exact else None
+
+    def with_tensors(self, tensors: Sequence[Tensor]) -> GridField:
+        (values,) = tensors
+        return self.with_coefficients(replace(self.coefficients, values=values))
+
     def detached(self) -> GridField:
         """The same field, of coefficients that no derivatives are asked by; they are shared, not copied."""
-        if not self.requires_grad:
-            return self
-        return self.with_coefficients(replace(self.coefficients, values=self.coefficients.values.detach()))
+        return self.with_tensors([self.coefficients.values.detach()]) if self.requires_grad else self
 
     def _relative_to(self, origin: tuple[float, float, float]) -> GridField:
         """The grid moves instead: numbers of float64, no work for any point."""

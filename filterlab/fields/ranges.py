@@ -5,7 +5,7 @@ Bernstein coefficient of the tap's weight, axis by axis. That is exact about ker
 coefficients that overshoot: bounds of the taps alone let through up to ten times as many cells. Where cells meet, a
 continuous field has the same coefficients in both: they are computed once.
 
-    coefficients ──▶ Bernstein coefficients, one layer of bricks at a time ──▶ least and greatest of every brick
+    coefficients ──▶ Bernstein coefficients, a few layers at a time ──▶ least and greatest of every brick
 
 Built once for a volume, in float64; then a level costs two comparisons a brick. A brick with a coefficient that is not
 finite has NaN for bounds, and may hold anything.
@@ -27,6 +27,7 @@ from filterlab.ops.raycast import clear_of
 from filterlab.ops.stencil import Product
 
 _MANY = 1 << 25  # cells from which on bricks have edges of 4, not 2
+_AT_ONCE = 8  # cells along z, of which taps are summed together: fewer are read again and again, more leave the cache
 _ROUNDING = 64  # units of rounding that a sum of taps may lose, relative to Σ |w| · max |c|
 
 
@@ -118,10 +119,11 @@ def _norm(lattice: Lattice) -> float:
 
 
 def layers_of(lattice: Lattice, edge: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """(low, high) of one layer of bricks after the other, (1, by, bx) each: no more than a layer is in memory."""
+    """(low, high) of a few layers of bricks after the others, (…, by, bx) each: no more than these are in memory."""
     values, (_, _, sz), (_, _, depth) = lattice.coefficients.detach(), lattice.supports, lattice.cells
-    for first in range(0, depth, edge):
-        cells = min(edge, depth - first)
+    step = max(_AT_ONCE // edge, 1) * edge
+    for first in range(0, depth, step):
+        cells = min(step, depth - first)
         slab = values.narrow(0, first, cells + sz - 1).double()
         hull = lattice.scale * _hull(slab, lattice) + lattice.shift
         low = high = hull

@@ -2,13 +2,15 @@
 
 Letters: a ray is o + t d, t ≥ 0, with d of any length, so t is in units of d; g = ∇F.
 
-A hit is found without derivatives and gets them from Newton's method: with the slope s = g·d held fixed, each step
+A hit is found without derivatives and gets them from F(o + t d) = 0: with the slope s = g·d
 
-    t ← t − F(o + t d) / s
+    dt = −(dF + g·do + t g·dd) / s,    dF by whatever numbers F is made of, at the hit
 
-makes t right to one more order in whatever o, d and F depend on. Two steps are attached: first and second derivatives
-in samples, level and rays are exact, and t itself keeps its bits. s is the derivative of F along the ray itself,
-whatever a field gives as its gradient. Where it is 0, at tangents, a hit has no derivative, and gets 0.
+which is evaluated once more, at a hit with derivatives, where derivatives of it are asked in turn: so they are exact to
+any order, and t keeps its bits. Backward passes keep the rays and t; they cost a gather, a pull and a splat. Of
+surfaces that cannot tell their numbers two steps of Newton's method are recorded instead, t ← t − F(o + t d) / s, each
+right to one more order. s is the derivative of F along the ray itself, whatever a field gives as its gradient. Where it
+is 0, at tangents, a hit has no derivative, and gets 0.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Domain, check_order
+from filterlab.ops.differentiable.recording import transforming
 
 MAX_SHEETS = 4096
 _STEPS = 2  # of Newton's method: derivatives up to the second
@@ -85,6 +88,15 @@ class Surface(ABC):
     @abstractmethod
     def detached(self) -> Surface:
         """The same surface, of numbers that no derivatives are asked by: searching it records nothing."""
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...] | None:
+        """All numbers that F is made of and may have derivatives by; None: it cannot tell."""
+        return None
+
+    def with_tensors(self, tensors: Sequence[Tensor]) -> Surface:
+        """The same surface, made of others in place of `tensors`."""
+        raise TypeError(f"{type(self).__name__} cannot tell its tensors")
 
     @abstractmethod
     def _first(self, origins: Tensor, directions: Tensor) -> Tensor:
@@ -164,17 +176,16 @@ class Surface(ABC):
     def _value(self, points: Tensor) -> Tensor:
         return self.jet(points, 0)[0]
 
-    def _slope(self, points: Tensor, directions: Tensor) -> Tensor:
-        """∇F·d of F itself, not of what a field calls its gradient; 1 / s is 0 where it is 0: ∞ stands there."""
+    def _differentiated(self, points: Tensor, tensors: Sequence[Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        """F at points (M, 3), to be differentiated by its tensors (or these in their place), and its true gradient."""
         with torch.enable_grad():
             x = points.detach().requires_grad_()
-            (gradient,) = torch.autograd.grad(self._value(x).sum(), x)
-        slope = (gradient * directions.detach()).sum(-1)
-        return torch.where(slope == 0, torch.inf, slope)
+            value = (self if tensors is None else self.with_tensors(tensors))._value(x)
+            (gradient,) = torch.autograd.grad(value.sum(), x, retain_graph=True)
+        return value, gradient
 
-    def _follows(self, origins: Tensor, directions: Tensor, t: Tensor) -> bool:
-        """Whether hits move with anything that derivatives are asked by."""
-        return self._value(origins + t * directions).requires_grad
+    def _slope(self, points: Tensor, directions: Tensor) -> Tensor:
+        return _along_rays(self._differentiated(points)[1], directions.detach())
 
     def _attached(self, t: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
         """The same t, with derivatives."""
@@ -184,12 +195,24 @@ class Surface(ABC):
         if not len(index) or not self._follows(*_chosen(index[:1], t.shape, origins, directions, t[..., None])):
             return t
         o, d, own = _chosen(index, t.shape, origins, directions, t[..., None])
-        own = own[:, 0]
-        slope = self._slope(_along(o, d, own), d)
-        for _ in range(_STEPS):
-            value = self._value(_along(o, d, own))
-            own = own - (value - value.detach()) / slope
+        tensors = self.tensors
+        if tensors is None or transforming():
+            own = self._stepped(o, d, own[:, 0])
+        else:
+            own = _Attached.apply(self, own[:, 0], o, d, *tensors)
         return t.flatten().index_copy(0, index, own).reshape(t.shape)
+
+    def _follows(self, origins: Tensor, directions: Tensor, t: Tensor) -> bool:
+        """Whether hits move with anything that derivatives are asked by."""
+        return self._value(origins + t * directions).requires_grad
+
+    def _stepped(self, origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
+        """t (M,) with the derivatives of steps of Newton's method."""
+        slope = self._slope(_along(origins, directions, t), directions)
+        for _ in range(_STEPS):
+            value = self._value(_along(origins, directions, t))
+            t = t - (value - value.detach()) / slope
+        return t
 
     def _polished(self, origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
         """o + t d; far from where rays begin moved along them by what it was rounded by."""
@@ -212,6 +235,50 @@ class Surface(ABC):
             new = moved + step.clamp(-most, most)[:, None] * directions
             moved = torch.where((self._value(points + new).abs() < value.abs())[:, None], new, moved)
         return moved
+
+
+class _Attached(torch.autograd.Function):
+    """(surface, t (M,), origins, directions (M, 3), its tensors) -> t, which moves as F(o + t d) = 0 demands."""
+
+    @staticmethod
+    def forward(ctx, surface: Surface, t: Tensor, *moving: Tensor):
+        ctx.surface = surface
+        ctx.save_for_backward(t, *moving)
+        return t.clone()
+
+    @staticmethod
+    def backward(ctx, *cotangents: Tensor):
+        t, origins, directions, *tensors = ctx.saved_tensors
+        needed = ctx.needs_input_grad[4:]
+        if torch.is_grad_enabled():
+            t = _Attached.apply(ctx.surface, t, origins, directions, *tensors)
+            tensors = [x.view_as(x) for x in tensors]  # t depends on them as well
+            points = _along(origins, directions, t)
+            value = ctx.surface.with_tensors(tensors)._value(points)
+            (gradient,) = torch.autograd.grad(value.sum(), points, create_graph=True)
+        else:
+            tensors = [x.detach().requires_grad_(need) for x, need in zip(tensors, needed, strict=True)]
+            points = _along(origins, directions, t)
+            value, gradient = ctx.surface._differentiated(points, tensors)
+        weight = -cotangents[0] / _along_rays(gradient, directions)
+        by_rays = weight[:, None] * gradient, (weight * t)[:, None] * gradient
+        return None, None, *by_rays, *_by_tensors(value, tensors, needed, weight)
+
+
+def _by_tensors(value: Tensor, tensors: Sequence[Tensor], needed: Sequence[bool], weight: Tensor):
+    """Derivatives of Σ weight · value by the tensors that need them, None for the others."""
+    if not any(needed):
+        return [None] * len(needed)
+    inputs = [x for x, need in zip(tensors, needed, strict=True) if need]
+    graph = torch.is_grad_enabled()
+    found = iter(torch.autograd.grad(value, inputs, weight, create_graph=graph, allow_unused=True))
+    return [next(found) if need else None for need in needed]
+
+
+def _along_rays(gradient: Tensor, directions: Tensor) -> Tensor:
+    """s = g·d (M,); 1 / s is 0 where it is 0: ∞ stands there."""
+    slope = (gradient * directions).sum(-1)
+    return torch.where(slope == 0, torch.inf, slope)
 
 
 def check_sheets(sheets: int) -> None:

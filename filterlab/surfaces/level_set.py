@@ -19,6 +19,7 @@ others the root search of `filterlab.roots` cannot miss one. Nothing is stepped,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
 
 import torch
@@ -56,6 +57,15 @@ class LevelSet(Surface):
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         value, *derivatives = self.field.jet(points, order)
         return value - self.level, *derivatives
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...] | None:
+        own, level = self.field.tensors, self.level
+        return own if own is None or not isinstance(level, Tensor) else (*own, level)
+
+    def with_tensors(self, tensors: Sequence[Tensor]) -> LevelSet:
+        given, own = list(tensors), self.field.tensors or ()
+        return LevelSet(self.field.with_tensors(given[: len(own)]), *(given[len(own) :] or [self.level]))
 
     @property
     def detached(self) -> LevelSet:

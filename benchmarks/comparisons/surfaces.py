@@ -1,0 +1,177 @@
+"""Level sets: rays against Mitsuba's trilinear `sdfgrid` and Embree's triangles, plain torch, derivatives, growth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import cycle
+from typing import Any
+
+import torch
+
+from benchmarks.comparisons.scaling import thread_numbers
+from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item, usable_cores
+from benchmarks.peers import embree_mesh, mitsuba_sdfgrid
+from benchmarks.peers.task import Casting
+from benchmarks.records import at_least, at_most
+from benchmarks.scene import marschner_lobb
+from benchmarks.settings import Settings
+from filterlab.methods import METHODS, reconstruct
+from filterlab.surfaces import LevelSet
+
+_LEVEL = 0.5
+_LEVELS = (0.48, 0.49, 0.5, 0.51, 0.52)
+_BARS = {"trilinear": at_most("0.25"), "triquadratic": at_most("0.45"), "tricubic": at_most("0.9")}
+_PLAIN = 64  # pixels along an edge of what plain torch casts
+
+
+def _task(settings: Settings, size: int | None = None, voxels: int | None = None) -> Casting:
+    scene = marschner_lobb(voxels or settings.image_voxels, size or 2 * settings.image)
+    origins, directions = scene.camera.rays(scene.size, scene.size)
+    origins, directions = (x.expand(directions.shape).reshape(-1, 3).float() for x in (origins, directions))
+    return Casting(scene.volume, _LEVEL, origins.contiguous(), directions.contiguous(), settings.threads)
+
+
+def _described(task: Casting) -> str:
+    n = task.volume.shape[-1]
+    return f"Marschner-Lobb {n}³ float32, level {task.level:g}, {len(task.origins):,} rays"
+
+
+def _surface(task: Casting, method: str, scheme: str = "fused") -> LevelSet:
+    gradient = "analytic" if method == "trilinear" else None
+    return LevelSet(reconstruct(task.volume, method, scheme=scheme, gradient=gradient), task.level)
+
+
+def _hits(task: Casting, method: str, scheme: str = "fused", name: str | None = None) -> Contestant:
+    """First hits and normals."""
+    surface = _surface(task, method, scheme)
+
+    def call() -> Any:
+        hit = surface.hit(task.origins, task.directions)
+        return hit.t, surface.at(task.origins, task.directions, hit).normal
+
+    computes = task.computes if method == "trilinear" else f"{method} hits"
+    return Contestant(name or method, call, computes, lambda found: task.summary(found[0].numpy()), len(task.origins))
+
+
+def _first(settings: Settings) -> Race:
+    task = _task(settings)
+    contestants, absent, ratios = [_hits(task, method) for method in METHODS], {}, []
+    for peer in (mitsuba_sdfgrid, embree_mesh):
+        if why := peer.missing():
+            absent[peer.NAME] = why
+            continue
+        contestants.append(peer.casting(task))
+    if mitsuba_sdfgrid.NAME not in absent:
+        ratios += [Ratio(method, mitsuba_sdfgrid.NAME, bar) for method, bar in _BARS.items()]
+    if embree_mesh.NAME not in absent:
+        ratios.append(Ratio("triquadratic", embree_mesh.NAME, at_most("2")))
+    what = f"{_described(task)}: first hits and normals; {embree_mesh.NAME} without"
+    return Race(what, contestants, ratios, tolerance=2e-3, absent=absent)
+
+
+def _new_level(settings: Settings) -> Race:
+    """Another level in every call: nothing that was found out for one serves the next."""
+    task = _task(settings)
+    field = reconstruct(task.volume, "triquadratic")
+    levels = cycle(_LEVELS)
+
+    def call() -> Any:
+        surface = LevelSet(field, next(levels))
+        hit = surface.hit(task.origins, task.directions)
+        return hit.t, surface.at(task.origins, task.directions, hit).normal
+
+    contestants = [Contestant("triquadratic", call, samples=len(task.origins))]
+    what = f"{_described(task)}: from a new level to hits (and normals)"
+    if why := embree_mesh.missing():
+        return Race(what, contestants, absent={embree_mesh.NAME: why})
+    other: Iterator[float] = cycle(_LEVELS)
+    contestants.append(embree_mesh.new_level(task, lambda: next(other)))
+    return Race(what, contestants, [Ratio("triquadratic", contestants[1].name, at_most("1/3"))])
+
+
+def _plain(settings: Settings) -> Race:
+    """Fewer rays: plain torch takes some 0.2 ms for each."""
+    task = _task(settings, min(_PLAIN, settings.image))
+    contestants, ratios = [], []
+    for method in METHODS:
+        contestants += [_hits(task, method, scheme, f"{method}, {scheme}") for scheme in ("fused", "direct")]
+        ratios.append(Ratio(f"{method}, fused", f"{method}, direct", at_most("1/30")))
+    return Race(f"{_described(task)}: first hits and normals", contestants, ratios)
+
+
+def _backward(settings: Settings) -> Race:
+    """Of samples that are new in every call, as in a descent: coefficients and bounds are made anew either way."""
+    task = _task(settings)
+    volume, origins = task.volume.clone().requires_grad_(), task.origins.clone().requires_grad_()
+
+    def forward() -> Any:
+        surface = LevelSet(reconstruct(volume, "triquadratic"), task.level)
+        hit = surface.hit(origins, task.directions)
+        at = surface.at(origins, task.directions, hit)
+        assert at.normal is not None
+        return torch.where(hit.valid, hit.t, 0).sum() + at.normal.sum()
+
+    def alone() -> Any:
+        with torch.no_grad():
+            return forward()
+
+    contestants = [
+        Contestant("forward", alone, samples=len(origins)),
+        Contestant(
+            "forward + backward", lambda: torch.autograd.grad(forward(), (volume, origins)), samples=len(origins)
+        ),
+    ]
+    ratios = [Ratio("forward + backward", "forward", at_most("3"))]
+    return Race(f"{_described(task)}: gradients of depths and normals to samples and origins", contestants, ratios)
+
+
+def _threads(settings: Settings) -> Race:
+    task = _task(settings)
+    numbers = thread_numbers(usable_cores())
+    contestants = [_on(threads, _hits(task, "triquadratic")) for threads in numbers]
+    ratios = [
+        Ratio(contestants[0].name, c.name, at_least("1.8") if n == 2 else None)
+        for n, c in zip(numbers[1:], contestants[1:], strict=True)
+    ]
+    absent = {} if len(numbers) > 1 else {"2 threads": "one core only"}
+    return Race(f"{_described(task)}: first hits and normals on threads", contestants, ratios, absent=absent)
+
+
+def _on(threads: int, c: Contestant) -> Contestant:
+    def call() -> Any:
+        torch.set_num_threads(threads)
+        return c.call()
+
+    return replace(c, name=f"{threads} thread{'s' * (threads != 1)}", call=call)
+
+
+def _growth(settings: Settings, what: str) -> Race:
+    """Twice as many pixels, or voxels, along an edge."""
+    task = _task(settings)
+    size, voxels = 2 * settings.image, settings.image_voxels
+    cases: dict[str, Callable[[], Casting]] = {
+        "pixels": lambda: _task(settings, size // 2),
+        "voxels": lambda: _task(settings, size, voxels // 2),
+    }
+    small = _hits(cases[what](), "triquadratic", name=f"half the {what} along an edge")
+    large = _hits(task, "triquadratic", name="all")
+    contestants = [replace(c, computes=None) for c in (small, large)]
+    return Race(f"{_described(task)}: first hits and normals", contestants, [Ratio("all", small.name)])
+
+
+def _items(settings: Settings) -> list[Item]:
+    return [
+        race_item("first", 30, _first),
+        race_item("new-level", 30, _new_level),
+        race_item("plain", 60, _plain),
+        race_item("backward", 10, _backward),
+        race_item("threads", 5, _threads, threads=usable_cores()),
+        race_item("pixels", 5, lambda s: _growth(s, "pixels")),
+        race_item("voxels", 5, lambda s: _growth(s, "voxels")),
+    ]
+
+
+COMPARISON = Comparison(
+    "surfaces", "first hits of level sets, against Mitsuba's sdfgrid and Embree's triangles", _items
+)

@@ -1,0 +1,52 @@
+"""Marching cubes (scikit-image) and Embree (embreex): rays and the triangles of a level set, without normals."""
+
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from skimage.measure import marching_cubes
+
+from benchmarks.harness import Contestant
+from benchmarks.peers.task import Casting, without
+
+NAME = "Embree"
+
+
+def missing() -> str | None:
+    """It has one thread only."""
+    return without("embreex")
+
+
+def casting(task: Casting) -> Contestant:
+    """The rays alone: triangles and tree are made beforehand."""
+    scene, rays = built(task, task.level), _rays(task)
+    return Contestant(NAME, lambda: _traced(scene, rays), samples=len(task.origins))
+
+
+def built(task: Casting, level: float) -> Any:
+    """Marching cubes, and the tree of what they give."""
+    from embreex import rtcore_scene
+    from embreex.mesh_construction import TriangleMesh
+
+    vertices, faces, *_ = marching_cubes(task.volume.numpy(), level)
+    scene = rtcore_scene.EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(vertices[:, ::-1], dtype=np.float32), faces.astype(np.int32))
+    return scene
+
+
+def new_level(task: Casting, level: Any) -> Contestant:
+    """From `level()` to hits."""
+    rays = _rays(task)
+    name = f"marching cubes + {NAME}"
+    return Contestant(name, lambda: _traced(built(task, level()), rays), samples=len(task.origins))
+
+
+def _rays(task: Casting) -> tuple[np.ndarray, np.ndarray]:
+    return task.origins.numpy(), task.directions.numpy()
+
+
+def _traced(scene: Any, rays: tuple[np.ndarray, np.ndarray]) -> Any:
+    return scene.run(*rays)
