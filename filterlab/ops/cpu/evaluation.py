@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import torch
 from torch import Tensor
 
 from filterlab.ops.cpu.gather import Gathering
@@ -10,16 +13,21 @@ from filterlab.ops.place import Placement
 from filterlab.ops.stencil import Stencil
 
 
+@dataclass(frozen=True)
 class Evaluator:
-    """Rows of a stencil at world points of one dtype, and how the points were turned; no derivatives."""
+    """What gives rows of a stencil at world points of one dtype; no derivatives.
 
-    def __init__(
-        self, coefficients: Tensor, placement: Placement, stencil: Stencil, start: int, points: Tensor
-    ) -> None:
-        self.place = Placing(placement, points.dtype)
-        self.gather = Gathering(coefficients, stencil, start, points.dtype)
+    Attributes:
+        place: world points (N, M, 3) to located points, and their sign or None.
+        gather: located points to rows (N, C, J, M).
+    """
 
-    def __call__(self, points: Tensor) -> tuple[Tensor, Tensor | None]:
-        """(N, M, 3) -> rows (N, C, J, M), and sign (N, M, 3) or None."""
-        located, sign = self.place(points)
-        return self.gather(located), sign
+    place: Placing
+    gather: Gathering
+
+    @classmethod
+    def of(
+        cls, coefficients: Tensor, placement: Placement, stencil: Stencil, start: int, dtype: torch.dtype
+    ) -> Evaluator:
+        """For points of that dtype."""
+        return cls(Placing(placement, dtype), Gathering(coefficients, stencil, start, dtype))

@@ -15,6 +15,7 @@ from llvmlite import ir
 from filterlab.ops.cpu.lanes import DOUBLE, I64, POINTER, Lanes, Value
 
 ENTRY = "run"  # name of the compiled function
+SHARED = ("next", "met")
 
 
 def new_module() -> tuple[ir.Module, ir.Function]:
@@ -26,12 +27,12 @@ def new_module() -> tuple[ir.Module, ir.Function]:
 
 
 def load_job(e: Lanes, address: Value, fields: Mapping[str, type]) -> SimpleNamespace:
-    """The fields of a job (each of 64 bits), as values; `next` as an address, threads share it."""
+    """The fields of a job (each of 64 bits), as values; those that threads write (`SHARED`) as addresses."""
     loaded = {}
     for index, (name, ctype) in enumerate(fields.items()):
         kind = {"P": POINTER, "d": DOUBLE}.get(ctype._type_, I64)  # type: ignore[attr-defined]
         where = e.advance(address, I64(index), I64)
-        loaded[name] = where if name == "next" else e.builder.load(where, typ=kind)
+        loaded[name] = where if name in SHARED else e.builder.load(where, typ=kind)
     return SimpleNamespace(**loaded)
 
 

@@ -39,8 +39,9 @@ class Job(ctypes.Structure):
             setattr(self, name, array.data_ptr() if isinstance(array, Tensor) else array.ctypes.data)
         self.memory += tuple(arrays.values())
 
-    def copy(self) -> Self:
-        """Another job of the same arrays."""
+    def copy(self, **arrays: Tensor | np.ndarray) -> Self:
+        """Another job of the same arrays, and of these."""
         other = type(self).from_buffer_copy(self)
         other.memory = self.memory
+        other.point(**arrays)
         return other

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +17,6 @@ from filterlab.ops.reference import place as reference
 from filterlab.volume import Boundary
 
 _POINTS_PER_THREAD = 4096  # fewer are not worth waking a thread for
-_TURNED, _LOST = {TURNED, TURNED | LOST}, {LOST, TURNED | LOST}
 
 
 def place(points: Tensor, placement: Placement) -> Placed:
@@ -44,26 +42,23 @@ class Placing:
     def __call__(self, points: Tensor) -> Placed:
         """(..., 3) to (located, sign)."""
         located = fresh(points.shape, self.dtype)
-        if points.numel() == 0:
+        count = points.numel() // 3
+        if count == 0:
             return located, None
         points = readable(points, 0)
-        count = points.numel() // 3
         threads = threads_for(count, _POINTS_PER_THREAD)
         packs = -(-count // self.lanes)
         chunk = min(-(-packs // (threads * CHUNKS_PER_THREAD if threads > 1 else 1)), MOST_POINTS // self.lanes)
-        chunks = -(-packs // chunk)
-        met = np.zeros(chunks, np.int64)
-        job = self.job.copy()
-        job.point(points=points, located=located, met=met)
-        job.count, job.chunk, job.chunks = count, chunk, chunks
+        job = self.job.copy(points=points, located=located)
+        job.count, job.chunk, job.chunks = count, chunk, -(-packs // chunk)
         pool.run(self.run, [job] * threads)
-        found, sign = set(met.tolist()), None
-        if found & _TURNED:
+        met, sign = job.met, None
+        if met & TURNED:
             sign = fresh(points.shape, self.dtype)
             job.point(signs=sign)
             job.next = 0
             pool.run(self._program(signs=True), [job] * threads)
-        return self._with_lost(points, located, sign) if found & _LOST else (located, sign)
+        return self._with_lost(points, located, sign) if met & LOST else (located, sign)
 
     def _with_lost(self, points: Tensor, located: Tensor, sign: Tensor | None) -> Placed:
         """The few points that are NaN or beyond the range of their type are left to the plain twin."""
