@@ -17,13 +17,21 @@ from filterlab.ops.cpu.lanes import DOUBLE, I64, POINTER, Lanes, Value
 ENTRY = "run"  # name of the compiled function
 SHARED = ("next", "met")
 
+_SIGNATURE = ir.FunctionType(ir.VoidType(), [POINTER, I64, I64])
+
 
 def new_module() -> tuple[ir.Module, ir.Function]:
     """A module with the empty function `run`."""
     module = ir.Module("filterlab")
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER, I64, I64]), ENTRY)
+    function = ir.Function(module, _SIGNATURE, ENTRY)
     function.attributes.add("nounwind")
     return module, function
+
+
+def call(builder: ir.IRBuilder, program: Value, job: Value) -> None:
+    """One chunk of a job by the program at an address."""
+    program.type = ir.PointerType(_SIGNATURE)  # llvmlite wants to know what it calls
+    builder.call(program, [job, I64(0), I64(1)])
 
 
 def load_job(e: Lanes, address: Value, fields: Mapping[str, type]) -> SimpleNamespace:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from filterlab.ops.cpu.job import AXES, Function
 from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, MOST_POINTS, lanes_of, threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh, zeros
 from filterlab.ops.cpu.order import Sorted
+from filterlab.ops.cpu.place import Placing
 from filterlab.ops.cpu.points import BLOCK, PointsJob, PointsVariant
 from filterlab.ops.gather import STORAGE, readable
 from filterlab.ops.stencil import Stencil
@@ -53,8 +54,7 @@ class Gathering:
 
     def __call__(self, points: Tensor) -> Tensor:
         """(N, M, 3) -> (N, C, J, M)."""
-        entries, count, _ = points.shape
-        out = fresh((entries, self.channels, self.rows, count), self.dtype)
+        out = self.fresh(points)
         if out.numel() == 0:
             return out
         points = readable(points, 1)
@@ -63,6 +63,11 @@ class Gathering:
         else:
             pool.run(self.program.run, self.program.shared(self.coefficients, points, out))
         return out
+
+    def fresh(self, points: Tensor) -> Tensor:
+        """What the rows at these points are written to."""
+        entries, count, _ = points.shape
+        return fresh((entries, self.channels, self.rows, count), self.dtype)
 
     def _sorted(self, points: Tensor, out: Tensor) -> None:
         for entry, part, ordered in _in_order(points, self.coefficients.shape, self.start):
@@ -135,7 +140,12 @@ def _arranged(ordered: Sorted, cotangents: Tensor) -> Tensor:
 
 def _sorting_pays(points: Tensor, bytes_of_channel: int) -> bool:
     """Whether sorting points (N, M, 3) costs less than it saves (`order`)."""
-    return points.shape[1] >= FEWEST_SORTED and bytes_of_channel >= SMALLEST_SORTED_IN and order.scattered(points)
+    return sorting_may_pay(points, bytes_of_channel) and order.scattered(points)
+
+
+def sorting_may_pay(points: Tensor, bytes_of_channel: int) -> bool:
+    """Whether it is worth looking at located points."""
+    return points.shape[1] >= FEWEST_SORTED and bytes_of_channel >= SMALLEST_SORTED_IN
 
 
 def _in_order(points: Tensor, shape: Sequence[int], start: int) -> Iterator[tuple[int, slice, Sorted]]:
@@ -200,6 +210,12 @@ class Program:
         most = max(1, MOST_POINTS // (lanes * BLOCK * max(1, volume.shape[1])))
         return cls(compiler.compiled(variant), job, lanes, most)
 
+    def after(self, place: Placing) -> Program:
+        """gather at points that this places first."""
+        job = self.job.copy()
+        job.call(place=place.run, placing=place.job)
+        return replace(self, job=job)
+
     def shared(self, coefficients: Tensor, points: Tensor, rows: Tensor, **gradient: Tensor) -> list[PointsJob]:
         """gather or pull, a job for every thread: all share the points, chunk by chunk.
 
@@ -210,9 +226,7 @@ class Program:
         """
         threads = _threads(points)
         blocks = self._blocks(points, threads * CHUNKS_PER_THREAD if threads > 1 else 1)
-        job = self._described(points, rows, min(blocks, self.most))
-        job.point(coefficients=coefficients, **gradient)
-        return [job] * threads
+        return [self._described(points, rows, min(blocks, self.most), coefficients=coefficients, **gradient)] * threads
 
     def divided(self, volumes: Sequence[Tensor], points: Tensor, rows: Tensor) -> list[PointsJob]:
         """scatter: a job for each of `volumes` (as of `memory.zeros`), with an equal share of the points."""
@@ -227,10 +241,10 @@ class Program:
         packs = -(-points.shape[1] // self.lanes)
         return -(-packs // (parts * BLOCK))
 
-    def _described(self, points: Tensor, rows: Tensor, blocks: int) -> PointsJob:
+    def _described(self, points: Tensor, rows: Tensor, blocks: int, **arrays: Tensor) -> PointsJob:
         """The job of these points in chunks of so many blocks."""
         entries, count, _ = points.shape
-        job = self.job.copy(points=points, rows=rows)
+        job = self.job.copy(points=points, rows=rows, **arrays)
         assert all((job.points, job.rows)), "tensors without memory"
         chunk = blocks * BLOCK
         job.count, job.entries, job.points_entry = count, entries, points.stride(0)

@@ -26,18 +26,23 @@ class Job(ctypes.Structure):
     Attributes:
         next: the chunk to be taken next; threads add 1 atomically.
         chunks: `next` stops here.
-        memory: the arrays that it points to.
+        memory: the arrays that it points to, and whatever else.
     """
 
     next: int
     chunks: int
-    memory: tuple[Tensor | np.ndarray, ...] = ()
+    memory: tuple[object, ...] = ()
 
     def point(self, **arrays: Tensor | np.ndarray) -> None:
         """Write where arrays are into the fields of their names, and hold them."""
         for name, array in arrays.items():
             setattr(self, name, array.data_ptr() if isinstance(array, Tensor) else array.ctypes.data)
         self.memory += tuple(arrays.values())
+
+    def call(self, place: Function, placing: Job) -> None:
+        """Write where a program and its job are into the fields of their names, and hold them."""
+        self.place, self.placing = ctypes.cast(place, ctypes.c_void_p), ctypes.addressof(placing)  # type: ignore[arg-type]
+        self.memory += (place, placing)
 
     def copy(self, **arrays: Tensor | np.ndarray) -> Self:
         """Another job of the same arrays, and of these."""

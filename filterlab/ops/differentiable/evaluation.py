@@ -43,18 +43,14 @@ class Evaluation:
     def __call__(self, points: Tensor) -> Placed:
         """(N, M, 3) -> rows (N, C, J, M), and the sign (N, M, 3) of `ops.place` or None."""
         if self.implementation == "cpu" and plain(self.coefficients, points):
-            prepared = self._prepared.get(points.dtype) or self._prepare(points.dtype)
-            located, sign = prepared.place(points)
-            return prepared.gather(located), sign
+            return (self._prepared.get(points.dtype) or self._prepare(points.dtype))(points)
         if torch.compiler.is_compiling():
             return self._compiled(points)
         located, sign = place(points, self.placement, self.implementation)
         return gather(self.coefficients, located, self.stencil, self.start, self.implementation), sign
 
     def _prepare(self, dtype: torch.dtype) -> Evaluator:
-        made = driver("cpu", "evaluation").Evaluator.of(
-            self.coefficients, self.placement, self.stencil, self.start, dtype
-        )
+        made = driver("cpu", "evaluation").Evaluator(self.coefficients, self.placement, self.stencil, self.start, dtype)
         if made.gather.coefficients.data_ptr() == self.coefficients.data_ptr():  # a copy could become outdated
             self._prepared[dtype] = made
         return made
