@@ -195,7 +195,7 @@ class Geometry:
         regular = np.isfinite(m).all() and scale.min() > 0 and abs(np.linalg.det(m / scale)) >= 1e-9
         if not regular or not np.isfinite(self.origin).all():
             raise ValueError(f"the affine must be finite and invertible; got {self.affine.tolist()}")
-        _ = self.inverse, self.diagonal  # made now: torch.compile can't make them while it traces
+        _ = self.inverse, self.diagonal, self.is_identity  # made now: torch.compile can't make them while it traces
 
     @classmethod
     def of(
@@ -232,7 +232,7 @@ class Geometry:
         """World length of one voxel step along x, y, z."""
         return tuple(math.hypot(*column) for column in zip(*self.matrix, strict=True))  # type: ignore[return-value]
 
-    @property
+    @cached_property
     def is_identity(self) -> bool:
         return self.matrix == IDENTITY and self.origin == (0.0, 0.0, 0.0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from filterlab.fields.base import Field
 from filterlab.fields.tensor_product import SAMPLERS, exact_sample
 from filterlab.kernels import bc
 from filterlab.methods import METHODS, reconstruct
+from filterlab.ops.cpu import compiler
 from filterlab.ops.differentiable.gather import IMPLEMENTATIONS
 from filterlab.scenes.model import Reconstruction
 from filterlab.volume import Boundary
@@ -211,6 +213,40 @@ def test_coefficients_that_are_changed_in_place_are_seen(turned):
     before = other(at)
     values.mul_(2)
     assert torch.equal(other(at), 2 * before)
+
+
+@pytest.mark.parametrize(("count", "threads", "beyond"), [(1, 1, 0.0), (1, 1, 0.8), (20_000, 2, 0.0)])
+def test_six_frames_at_most_from_a_field_to_its_programs(count, threads, beyond, monkeypatch):
+    """`value_and_gradient` and what it calls, one within the other, until machine code runs."""
+    depths, compiled, before = [], compiler.compiled, torch.get_num_threads()
+
+    def watched(variant):
+        program = compiled(variant)
+
+        def run(*told):
+            depths.append(frames_since("value_and_gradient"))
+            program(*told)
+
+        return compiler._signature(run)  # it has an address, as programs have
+
+    monkeypatch.setattr(compiler, "compiled", watched)
+    field, at = reconstruct(volume(), "triquadratic", scheme="fused"), points(beyond=beyond)[0].expand(count, 3)
+    torch.set_num_threads(threads)
+    try:
+        field.value_and_gradient(at)
+    finally:
+        torch.set_num_threads(before)
+    assert 0 < max(depths) <= 6
+
+
+def frames_since(name: str) -> int:
+    """Frames of this thread but those of this file, out to the function of that name; 0 where there is none."""
+    names, frame = [], sys._getframe()
+    while frame is not None:
+        if frame.f_code.co_filename != __file__:  # one program calls another
+            names.append(frame.f_code.co_name)
+        frame = frame.f_back
+    return names.index(name) + 1 if name in names else 0
 
 
 def test_a_former_name_of_the_sampled_scheme_is_understood() -> None:

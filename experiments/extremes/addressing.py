@@ -13,7 +13,6 @@ import sys
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import torch
@@ -25,6 +24,7 @@ from experiments.extremes.coordinates import largest
 from filterlab.fields.grid import GridField
 from filterlab.kernels import bspline
 from filterlab.ops import Stencil, gather
+from filterlab.ops.cpu import threads
 from filterlab.ops.cpu.gather import Program, scatter
 from filterlab.ops.cpu.job import Function
 from filterlab.ops.cpu.machine import lanes_of
@@ -120,7 +120,8 @@ def scatter_into_many(_subject: Subject, random: np.random.Generator, amount: fl
         return Finding(0, 0.0, 0.0, skipped=memory)
     vast = torch.frombuffer(memory, dtype=torch.float32)[:-1].reshape(1, 1, EDGE, EDGE, EDGE)
     stencil = Stencil.jet(bspline(2), 1)
-    Program.of("scatter", vast, stencil, 0, vast.dtype).divide([vast], points + (EDGE - CORNER), cotangents)
+    program = Program.of("scatter", vast, stencil, 0, vast.dtype)
+    threads.run(program.run, program.divided([vast], points + (EDGE - CORNER), cotangents))
     expected = scatter(cotangents, points, stencil, (CORNER,) * 3)
     found = vast[..., -CORNER:, -CORNER:, -CORNER:]
     tally.error(largest(found - expected) / largest(expected), "something else was added to the corner", count)
@@ -141,8 +142,8 @@ def many_points(_subject: Subject, random: np.random.Generator, amount: float) -
     points[0, -count:] = torch.tensor(random.uniform(0, 6, (count, 3)), dtype=torch.float32)
     stencil = Stencil.jet(bspline(2), 1)
 
-    with mock.patch("filterlab.ops.cpu.threads.run", lambda function, jobs: _run_the_last(function, jobs[0], count)):
-        Program.of("gather", coefficients, stencil, 0, points.dtype).share(coefficients, points, rows)
+    program = Program.of("gather", coefficients, stencil, 0, points.dtype)
+    _run_the_last(program.run, program.shared(coefficients, points, rows)[0], count)
     expected = gather(coefficients, points[:, -count:].clone(), stencil, 0, "cpu")
     tally.kept(torch.equal(rows[..., -count:], expected), "other bits than those points alone", count)
     tally.kept(largest(expected) > 0.1, "the rows are empty")

@@ -348,30 +348,29 @@ class GridField(Field):
         flat = points.reshape(1 if self.channels is None else points.shape[0], math.prod(shape), 3)
         evaluations = self._own if self.channels is None or len(flat) == self.channels[0] else self._shared
         rows, sign = evaluations[order](flat)
-        value, *others = self._decoded(rows).split_with_sizes(_ROWS[: order + 1], 2)
-        out = [self._shaped(value[:, :, 0] if self.channels is not None else value, shape)]
+        axis = 0 if self.channels is None else 2
+        value, *others = self._decoded(rows, shape).split_with_sizes(_ROWS[: order + 1], axis)
+        if sign is not None:
+            sign = sign.reshape((*(len(flat), 1)[:axis], *shape, 3))  # over channels
+        out = [value.squeeze(axis)]
         if order >= 1:
-            gradient = others[0].movedim(2, -1)
+            gradient = others[0].movedim(axis, -1)
             if sign is not None:
-                gradient = gradient * sign[:, None]
-            out.append(self._shaped(self.domain.geometry.gradient_to_world(gradient), shape, 3))
+                gradient = gradient * sign
+            out.append(self.domain.geometry.gradient_to_world(gradient))
         if order >= 2:
-            hessian = _symmetric(others[1])
+            hessian = _symmetric(others[1], axis)
             if sign is not None:
-                hessian = hessian * (sign[..., :, None] * sign[..., None, :])[:, None]
-            out.append(self._shaped(self.domain.geometry.hessian_to_world(hessian), shape, 3, 3))
+                hessian = hessian * (sign[..., :, None] * sign[..., None, :])
+            out.append(self.domain.geometry.hessian_to_world(hessian))
         return tuple(out)
 
-    def _decoded(self, rows: Tensor) -> Tensor:
-        """Rows (N, C, J, M) of what stored integers stand for, and of a shared batch entry by entry."""
-        if self.channels is not None and rows.shape[:2] != self.channels:
-            rows = rows.reshape(*self.channels, *rows.shape[2:])
-        quantization = self.coefficients.quantization
-        return rows if quantization is None else quantization.of_rows(rows)
-
-    def _shaped(self, x: Tensor, shape: Sequence[int], *own: int) -> Tensor:
-        """(N, C, M, *own) to (N, C, *P, *own), or (*P, *own) for an unbatched field."""
-        return x.reshape((*(self.channels or ()), *shape, *own))
+    def _decoded(self, rows: Tensor, shape: Sequence[int]) -> Tensor:
+        """Rows (N, C, J, M) as (N, C, J, *P), or (J, *P) for an unbatched field; of what stored integers stand for."""
+        channels, quantization, count = self.channels or (), self.coefficients.quantization, rows.shape[2]
+        if quantization is not None:
+            rows = quantization.of_rows(rows.reshape(*(channels or (1, 1)), *rows.shape[2:]))
+        return rows.reshape(*channels, count, *shape)
 
 
 def _type_of_rays(origins: Tensor, directions: Tensor) -> torch.dtype:
@@ -382,7 +381,7 @@ _ROWS = (1, 3, 6)
 """Rows of a jet that are its value, its gradient, its Hessian."""
 
 
-def _symmetric(rows: Tensor) -> Tensor:
-    """(N, C, 6, M) of xx, xy, xz, yy, yz, zz to (N, C, M, 3, 3)."""
-    xx, xy, xz, yy, yz, zz = rows.unbind(2)
+def _symmetric(rows: Tensor, axis: int) -> Tensor:
+    """Rows xx, xy, xz, yy, yz, zz along an axis to matrices (..., 3, 3) of the other axes."""
+    xx, xy, xz, yy, yz, zz = rows.unbind(axis)
     return torch.stack([torch.stack(r, -1) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], -2)

@@ -363,12 +363,12 @@ def test_splat_keeps_to_its_memory(threads, monkeypatch: pytest.MonkeyPatch) -> 
     for limit, parts in ((0, 1), (volume, 2), (3 * volume + 5, 4), (1 << 30, 8)):
         monkeypatch.setattr(fused, "SPLAT_MEMORY", limit)
         asked = []
-        run = fused.Program.divide
+        run = fused.Program.divided
         monkeypatch.setattr(
-            fused.Program, "divide", lambda *a, run=run, asked=asked: (asked.append(len(a[1])), run(*a))
+            fused.Program, "divided", lambda *a, run=run, asked=asked: (asked.append(len(a[1])), run(*a))[1]
         )
         ops.splat(cotangents, points, bspline(2), 0, SHAPE, START, "cpu")
-        monkeypatch.setattr(fused.Program, "divide", run)
+        monkeypatch.setattr(fused.Program, "divided", run)
         assert asked == [parts]
 
 

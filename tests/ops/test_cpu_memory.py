@@ -41,6 +41,7 @@ from filterlab.fields.ncrsi import NCRSI_TERMS
 from filterlab.fields.tensor_product import Direct
 from filterlab.kernels import CATMULL_ROM, LINEAR, bspline
 from filterlab.ops import Stencil, gather
+from filterlab.ops.cpu import threads
 from filterlab.ops.cpu.gather import Program
 from filterlab.ops.gather import MAX_ORDER
 
@@ -62,7 +63,8 @@ for stencil, (dtype, stored) in cases:
             points = guarded(points, at_end)
             coefficients = guarded((torch.rand(2, 2, *shape) * 100).to(stored), at_end)
             rows = guarded(torch.full((2, 2, 4, m), 7, dtype=dtype), at_end)
-            Program.of("gather", coefficients, stencil, 0, dtype).share(coefficients, points, rows)
+            program = Program.of("gather", coefficients, stencil, 0, dtype)
+            threads.run(program.run, program.shared(coefficients, points, rows))
             expected = gather(coefficients, points, stencil)
             fine = ((points > -50) & (points < 50)).all(-1)[:, None, None].expand_as(rows)
             assert torch.allclose(rows[fine], expected[fine], rtol=1e-3, atol=1e-2 * float(expected[fine].abs().sum()))
@@ -70,11 +72,12 @@ for stencil, (dtype, stored) in cases:
             if derivatives.order <= MAX_ORDER:
                 gradient = guarded(torch.full((2, m, 3), 7, dtype=dtype), at_end)
                 pull = Program.of("pull", coefficients, derivatives, 0, dtype, raised)
-                pull.share(coefficients, points, rows, gradient)
+                threads.run(pull.run, pull.shared(coefficients, points, rows, gradient=gradient))
             if stored == dtype:  # into volumes with room for one number behind them
                 room = guarded(torch.zeros(coefficients.numel() + 1, dtype=dtype), at_end)
                 target = room[:-1].view_as(coefficients)
-                Program.of("scatter", target, stencil, 0, dtype).divide([target], points, rows)
+                program = Program.of("scatter", target, stencil, 0, dtype)
+                threads.run(program.run, program.divided([target], points, rows))
                 assert room[-1] == 0
 print("nothing outside was touched")
 """

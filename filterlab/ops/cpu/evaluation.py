@@ -2,24 +2,51 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
-from filterlab.ops.cpu.gather import Gathering
+from filterlab.ops.cpu import threads as pool
+from filterlab.ops.cpu.folding import LOST, TURNED
+from filterlab.ops.cpu.gather import Gathering, sorting_may_pay
+from filterlab.ops.cpu.memory import fresh
 from filterlab.ops.cpu.place import Placing
-from filterlab.ops.place import Placement
+from filterlab.ops.gather import readable
+from filterlab.ops.place import Placed, Placement
 from filterlab.ops.stencil import Stencil
 
 
 class Evaluator:
-    """Rows of a stencil at world points of one dtype, and how the points were turned; no derivatives."""
+    """Rows of a stencil at world points of one dtype, and how the points were turned; no derivatives.
+
+    One program places and gathers, block by block. In two steps go points that may have to be sorted once they are
+    located, and those of which some are lost.
+    """
 
     def __init__(
-        self, coefficients: Tensor, placement: Placement, stencil: Stencil, start: int, points: Tensor
+        self, coefficients: Tensor, placement: Placement, stencil: Stencil, start: int, dtype: torch.dtype
     ) -> None:
-        self.place = Placing(placement, points.dtype)
-        self.gather = Gathering(coefficients, stencil, start, points.dtype)
+        self.place = Placing(placement, dtype)
+        self.gather = Gathering(coefficients, stencil, start, dtype)
+        self.program = self.gather.program.after(self.place)
 
-    def __call__(self, points: Tensor) -> tuple[Tensor, Tensor | None]:
+    def __call__(self, points: Tensor) -> Placed:
         """(N, M, 3) -> rows (N, C, J, M), and sign (N, M, 3) or None."""
+        gather = self.gather
+        if sorting_may_pay(points, gather.bytes_of_channel):
+            return self._in_steps(points)
+        out = gather.fresh(points)
+        if out.numel() == 0:
+            return out, None
+        jobs = self.program.shared(gather.coefficients, readable(points, 1), out)
+        pool.run(self.program.run, jobs)
+        met, sign = jobs[0].met, None
+        if met & LOST:
+            return self._in_steps(points)
+        if met & TURNED:
+            located, sign = (fresh(points.shape, points.dtype) for _ in range(2))
+            pool.run(self.place.turning, self.place.shared(points, located=located, signs=sign))
+        return out, sign
+
+    def _in_steps(self, points: Tensor) -> Placed:
         located, sign = self.place(points)
         return self.gather(located), sign

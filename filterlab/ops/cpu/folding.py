@@ -25,14 +25,14 @@ from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import I1, I64, Lanes, Value
 
 TURNED, LOST = 1, 2
-"""What a chunk may have met: a sign that is not 1; a point that is located at NaN."""
+"""What a job may have met: a sign that is not 1; a point that is located at NaN."""
 
 FIELDS: dict[str, type] = {
     "next": ctypes.c_int64,  # the chunk to be taken next
     "points": ctypes.c_void_p,  # (M, 3)
     "located": ctypes.c_void_p,  # (M, 3)
     "signs": ctypes.c_void_p,  # (M, 3); written if the variant says so
-    "met": ctypes.c_void_p,  # one i64 per chunk: TURNED, LOST or both
+    "met": ctypes.c_int64,  # TURNED, LOST or both; threads add to it atomically
     "count": ctypes.c_int64,  # M
     "chunk": ctypes.c_int64,  # packs of a chunk
     "chunks": ctypes.c_int64,
@@ -87,10 +87,9 @@ class _Program:
         with frame.every_chunk(e, j) as chunk:
             packs = b.udiv(b.add(j.count, I64(e.count - 1)), I64(e.count))
             first = b.mul(chunk, j.chunk)
-            self.met.value = I64(0)
             with e.repeat(first, e.smaller(b.add(first, j.chunk), packs)) as pack:
                 self._write_pack(pack)
-            b.store(self.met.value, e.advance(j.met, chunk, I64))
+        b.atomic_rmw("or", j.met, self.met.value, "monotonic")
         b.ret_void()
 
     def _write_pack(self, pack: Value) -> None:

@@ -15,23 +15,32 @@ from llvmlite import ir
 from filterlab.ops.cpu.lanes import DOUBLE, I64, POINTER, Lanes, Value
 
 ENTRY = "run"  # name of the compiled function
+SHARED = ("next", "met")
+
+_SIGNATURE = ir.FunctionType(ir.VoidType(), [POINTER, I64, I64])
 
 
 def new_module() -> tuple[ir.Module, ir.Function]:
     """A module with the empty function `run`."""
     module = ir.Module("filterlab")
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER, I64, I64]), ENTRY)
+    function = ir.Function(module, _SIGNATURE, ENTRY)
     function.attributes.add("nounwind")
     return module, function
 
 
+def call(builder: ir.IRBuilder, program: Value, job: Value) -> None:
+    """One chunk of a job by the program at an address."""
+    program.type = ir.PointerType(_SIGNATURE)  # llvmlite wants to know what it calls
+    builder.call(program, [job, I64(0), I64(1)])
+
+
 def load_job(e: Lanes, address: Value, fields: Mapping[str, type]) -> SimpleNamespace:
-    """The fields of a job (each of 64 bits), as values; `next` as an address, threads share it."""
+    """The fields of a job (each of 64 bits), as values; those that threads write (`SHARED`) as addresses."""
     loaded = {}
     for index, (name, ctype) in enumerate(fields.items()):
         kind = {"P": POINTER, "d": DOUBLE}.get(ctype._type_, I64)  # type: ignore[attr-defined]
         where = e.advance(address, I64(index), I64)
-        loaded[name] = where if name == "next" else e.builder.load(where, typ=kind)
+        loaded[name] = where if name in SHARED else e.builder.load(where, typ=kind)
     return SimpleNamespace(**loaded)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from filterlab.ops.cpu.job import AXES, Function
 from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, MOST_POINTS, lanes_of, threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh, zeros
 from filterlab.ops.cpu.order import Sorted
+from filterlab.ops.cpu.place import Placing
 from filterlab.ops.cpu.points import BLOCK, PointsJob, PointsVariant
 from filterlab.ops.gather import STORAGE, readable
 from filterlab.ops.stencil import Stencil
@@ -53,21 +54,26 @@ class Gathering:
 
     def __call__(self, points: Tensor) -> Tensor:
         """(N, M, 3) -> (N, C, J, M)."""
-        entries, count = points.shape[:2]
-        out = fresh((entries, self.channels, self.rows, count), self.dtype)
+        out = self.fresh(points)
         if out.numel() == 0:
             return out
         points = readable(points, 1)
         if _sorting_pays(points, self.bytes_of_channel):
             self._sorted(points, out)
         else:
-            self.program.share(self.coefficients, points, out)
+            pool.run(self.program.run, self.program.shared(self.coefficients, points, out))
         return out
+
+    def fresh(self, points: Tensor) -> Tensor:
+        """What the rows at these points are written to."""
+        entries, count, _ = points.shape
+        return fresh((entries, self.channels, self.rows, count), self.dtype)
 
     def _sorted(self, points: Tensor, out: Tensor) -> None:
         for entry, part, ordered in _in_order(points, self.coefficients.shape, self.start):
             rows = fresh((1, self.channels, self.rows, ordered.count), self.dtype)
-            self.program.share(self.coefficients[entry : entry + 1], ordered.points[None], rows)
+            own = self.coefficients[entry : entry + 1]
+            pool.run(self.program.run, self.program.shared(own, ordered.points[None], rows))
             for channel in range(self.channels):
                 ordered.restore(rows[0, channel], out[entry, channel, :, part])
 
@@ -90,12 +96,12 @@ def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequenc
     cotangents, points = readable(cotangents.to(points.dtype), 0), readable(points, 1)
     program = Program.of("scatter", out, stencil, start, points.dtype)
     if not _sorting_pays(points, math.prod(shape) * points.element_size()):
-        program.divide([out, *more], points, cotangents)
+        pool.run(program.run, program.divided([out, *more], points, cotangents))
     else:
         for entry, part, ordered in _in_order(points, out.shape, start):
             rows = _arranged(ordered, cotangents[entry, :, :, part])
             own = [volume[entry : entry + 1] for volume in (out, *more)]
-            program.divide(own, ordered.points[None], rows)
+            pool.run(program.run, program.divided(own, ordered.points[None], rows))
     for part in more:
         out += part
     return out.contiguous()
@@ -111,12 +117,13 @@ def pull(coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: Sten
     program = Program.of("pull", coefficients, derivatives, start, points.dtype, raised)
     out = fresh(points.shape, points.dtype)
     if not _sorting_pays(points, math.prod(coefficients.shape[2:]) * coefficients.element_size()):
-        program.share(coefficients, points, cotangents, out)
+        pool.run(program.run, program.shared(coefficients, points, cotangents, gradient=out))
         return out
     for entry, part, ordered in _in_order(points, coefficients.shape, start):
         rows = _arranged(ordered, cotangents[entry, :, :, part])
         own = fresh((1, ordered.count, 3), points.dtype)
-        program.share(coefficients[entry : entry + 1], ordered.points[None], rows, own)
+        jobs = program.shared(coefficients[entry : entry + 1], ordered.points[None], rows, gradient=own)
+        pool.run(program.run, jobs)
         back = fresh((3, ordered.count), points.dtype)
         ordered.restore(own[0].T.contiguous(), back)
         out[entry, part] = back.T
@@ -133,7 +140,12 @@ def _arranged(ordered: Sorted, cotangents: Tensor) -> Tensor:
 
 def _sorting_pays(points: Tensor, bytes_of_channel: int) -> bool:
     """Whether sorting points (N, M, 3) costs less than it saves (`order`)."""
-    return points.shape[1] >= FEWEST_SORTED and bytes_of_channel >= SMALLEST_SORTED_IN and order.scattered(points)
+    return sorting_may_pay(points, bytes_of_channel) and order.scattered(points)
+
+
+def sorting_may_pay(points: Tensor, bytes_of_channel: int) -> bool:
+    """Whether it is worth looking at located points."""
+    return points.shape[1] >= FEWEST_SORTED and bytes_of_channel >= SMALLEST_SORTED_IN
 
 
 def _in_order(points: Tensor, shape: Sequence[int], start: int) -> Iterator[tuple[int, slice, Sorted]]:
@@ -154,11 +166,13 @@ class Program:
         run: the machine code.
         job: with everything but addresses and what the number of points decides.
         lanes: P.
+        most: blocks of a chunk.
     """
 
     run: Function
     job: PointsJob
     lanes: int
+    most: int
 
     @classmethod
     def of(
@@ -193,10 +207,17 @@ class Program:
         for axis, size, support in zip(AXES, (w, h, d), stencil.supports, strict=True):
             setattr(job, f"low_{axis}", start)
             setattr(job, f"high_{axis}", start + size - support)
-        return cls(compiler.compiled(variant), job, lanes)
+        most = max(1, MOST_POINTS // (lanes * BLOCK * max(1, volume.shape[1])))
+        return cls(compiler.compiled(variant), job, lanes, most)
 
-    def share(self, coefficients: Tensor, points: Tensor, rows: Tensor, gradient: Tensor | None = None) -> None:
-        """gather or pull: all threads share the points, chunk by chunk.
+    def after(self, place: Placing) -> Program:
+        """gather at points that this places first."""
+        job = self.job.copy()
+        job.call(place=place.run, placing=place.job)
+        return replace(self, job=job)
+
+    def shared(self, coefficients: Tensor, points: Tensor, rows: Tensor, **gradient: Tensor) -> list[PointsJob]:
+        """gather or pull, a job for every thread: all share the points, chunk by chunk.
 
         Args:
             points: (N, M, 3).
@@ -205,36 +226,25 @@ class Program:
         """
         threads = _threads(points)
         blocks = self._blocks(points, threads * CHUNKS_PER_THREAD if threads > 1 else 1)
-        job = self._described(points, rows, -(-blocks // self._cuts(blocks)))
-        job.point(coefficients=coefficients)
-        if gradient is not None:
-            job.point(gradient=gradient)
-        pool.run(self.run, [job] * threads)
+        return [self._described(points, rows, min(blocks, self.most), coefficients=coefficients, **gradient)] * threads
 
-    def divide(self, volumes: Sequence[Tensor], points: Tensor, rows: Tensor) -> None:
-        """scatter: a thread for each of `volumes` (as of `memory.zeros`), with an equal share of the points."""
+    def divided(self, volumes: Sequence[Tensor], points: Tensor, rows: Tensor) -> list[PointsJob]:
+        """scatter: a job for each of `volumes` (as of `memory.zeros`), with an equal share of the points."""
         blocks = self._blocks(points, len(volumes))
-        cuts = _least_divisor(blocks, self._cuts(blocks))  # shares end where they would without
+        cuts = _least_divisor(blocks, -(-blocks // self.most))  # shares end where they would without
         job = self._described(points, rows, blocks // cuts)
         firsts = range(0, job.chunks // job.entries, cuts)
-        shares = [_own_share(job, first, cuts, volume) for first, volume in zip(firsts, volumes, strict=False)]
-        pool.run(self.run, shares)
+        return [_own_share(job, first, cuts, volume) for first, volume in zip(firsts, volumes, strict=False)]
 
     def _blocks(self, points: Tensor, parts: int) -> int:
         """Blocks of packs in one of so many parts of an entry's points, or of a little fewer."""
         packs = -(-points.shape[1] // self.lanes)
         return -(-packs // (parts * BLOCK))
 
-    def _cuts(self, blocks: int) -> int:
-        """Into how many chunks so many blocks are cut at least."""
-        most = max(1, MOST_POINTS // (self.lanes * BLOCK * self.job.channels))
-        return -(-blocks // most)
-
-    def _described(self, points: Tensor, rows: Tensor, blocks: int) -> PointsJob:
+    def _described(self, points: Tensor, rows: Tensor, blocks: int, **arrays: Tensor) -> PointsJob:
         """The job of these points in chunks of so many blocks."""
-        entries, count = points.shape[:2]
-        job = self.job.copy()
-        job.point(points=points, rows=rows)
+        entries, count, _ = points.shape
+        job = self.job.copy(points=points, rows=rows, **arrays)
         assert all((job.points, job.rows)), "tensors without memory"
         chunk = blocks * BLOCK
         job.count, job.entries, job.points_entry = count, entries, points.stride(0)
@@ -244,8 +254,7 @@ class Program:
 
 def _own_share(job: PointsJob, first: int, parts: int, volume: Tensor) -> PointsJob:
     """The job of adding some parts of every batch entry's points to a volume of its own."""
-    own = job.copy()
-    own.point(coefficients=volume)
+    own = job.copy(coefficients=volume)
     own.next, own.chunks = first * job.entries, min((first + parts) * job.entries, job.chunks)
     return own
 

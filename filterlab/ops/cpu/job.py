@@ -26,12 +26,12 @@ class Job(ctypes.Structure):
     Attributes:
         next: the chunk to be taken next; threads add 1 atomically.
         chunks: `next` stops here.
-        memory: the arrays that it points to.
+        memory: the arrays that it points to, and whatever else.
     """
 
     next: int
     chunks: int
-    memory: tuple[Tensor | np.ndarray, ...] = ()
+    memory: tuple[object, ...] = ()
 
     def point(self, **arrays: Tensor | np.ndarray) -> None:
         """Write where arrays are into the fields of their names, and hold them."""
@@ -39,8 +39,14 @@ class Job(ctypes.Structure):
             setattr(self, name, array.data_ptr() if isinstance(array, Tensor) else array.ctypes.data)
         self.memory += tuple(arrays.values())
 
-    def copy(self) -> Self:
-        """Another job of the same arrays."""
+    def call(self, place: Function, placing: Job) -> None:
+        """Write where a program and its job are into the fields of their names, and hold them."""
+        self.place, self.placing = ctypes.cast(place, ctypes.c_void_p), ctypes.addressof(placing)  # type: ignore[arg-type]
+        self.memory += (place, placing)
+
+    def copy(self, **arrays: Tensor | np.ndarray) -> Self:
+        """Another job of the same arrays, and of these."""
         other = type(self).from_buffer_copy(self)
         other.memory = self.memory
+        other.point(**arrays)
         return other

@@ -27,4 +27,5 @@ def lanes_of(dtype: torch.dtype) -> int:
 
 def threads_for(count: int, least: int) -> int:
     """As many threads as torch uses, but each with `least` of `count` things to do or more; at least one."""
-    return max(1, min(torch.get_num_threads(), count // least))
+    worth = count // least
+    return min(torch.get_num_threads(), worth) if worth > 1 else 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +17,6 @@ from filterlab.ops.reference import place as reference
 from filterlab.volume import Boundary
 
 _POINTS_PER_THREAD = 4096  # fewer are not worth waking a thread for
-_TURNED, _LOST = {TURNED, TURNED | LOST}, {LOST, TURNED | LOST}
 
 
 def place(points: Tensor, placement: Placement) -> Placed:
@@ -43,27 +41,32 @@ class Placing:
 
     def __call__(self, points: Tensor) -> Placed:
         """(..., 3) to (located, sign)."""
-        located = fresh(points.shape, self.dtype)
+        located, sign = fresh(points.shape, self.dtype), None
         if points.numel() == 0:
             return located, None
+        jobs = self.shared(points, located=located)
+        pool.run(self.run, jobs)
+        met = jobs[0].met
+        if met & TURNED:
+            sign = fresh(points.shape, self.dtype)
+            pool.run(self.turning, self.shared(points, located=located, signs=sign))
+        return self._with_lost(points, located, sign) if met & LOST else (located, sign)
+
+    @property
+    def turning(self) -> Function:
+        """The program that writes signs too."""
+        return self._program(signs=True)
+
+    def shared(self, points: Tensor, **written: Tensor) -> list[FoldingJob]:
+        """A job for every thread: all share the points, chunk by chunk. One reads in `met` what there was."""
         points = readable(points, 0)
         count = points.numel() // 3
         threads = threads_for(count, _POINTS_PER_THREAD)
         packs = -(-count // self.lanes)
         chunk = min(-(-packs // (threads * CHUNKS_PER_THREAD if threads > 1 else 1)), MOST_POINTS // self.lanes)
-        chunks = -(-packs // chunk)
-        met = np.zeros(chunks, np.int64)
-        job = self.job.copy()
-        job.point(points=points, located=located, met=met)
-        job.count, job.chunk, job.chunks = count, chunk, chunks
-        pool.run(self.run, [job] * threads)
-        found, sign = set(met.tolist()), None
-        if found & _TURNED:
-            sign = fresh(points.shape, self.dtype)
-            job.point(signs=sign)
-            job.next = 0
-            pool.run(self._program(signs=True), [job] * threads)
-        return self._with_lost(points, located, sign) if found & _LOST else (located, sign)
+        job = self.job.copy(points=points, **written)
+        job.count, job.chunk, job.chunks = count, chunk, -(-packs // chunk)
+        return [job] * threads
 
     def _with_lost(self, points: Tensor, located: Tensor, sign: Tensor | None) -> Placed:
         """The few points that are NaN or beyond the range of their type are left to the plain twin."""

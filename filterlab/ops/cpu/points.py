@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 from llvmlite import ir
 
-from filterlab.ops.cpu import frame, job
+from filterlab.ops.cpu import folding, frame, job
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import I1, I64, POINTER, STORAGE, Lanes, Value, Variable
 from filterlab.ops.cpu.taps import Grid, Location, Taps
@@ -41,6 +42,9 @@ FIELDS: dict[str, type] = {
     "chunk": ctypes.c_int64,  # packs of a chunk
     "entries": ctypes.c_int64,  # N; chunk c is part c // N of batch entry c % N
     "chunks": ctypes.c_int64,  # `next` stops here
+    "place": ctypes.c_void_p,  # program of `folding` by which gather places points first; null: they are located
+    "placing": ctypes.c_void_p,  # its job, as far as no point decides
+    "met": ctypes.c_int64,  # what it met
 }
 
 
@@ -93,11 +97,14 @@ class _Program:
         self.scratch_rows = e.reserve(e.number, self.rows * e.count)
         self.addresses = e.reserve(I64, BLOCK * e.count)
         self.local = e.reserve(e.number, BLOCK * 3 * e.count)
+        placed = _Placed(e, j) if self.variant.operation == "gather" else None
         with frame.every_chunk(e, j) as chunk:
-            self._write_chunk(chunk)
+            self._write_chunk(chunk, placed)
+        if placed is not None:
+            placed.report()
         self.builder.ret_void()
 
-    def _write_chunk(self, chunk: Value) -> None:
+    def _write_chunk(self, chunk: Value, placed: _Placed | None) -> None:
         """Part chunk // N of batch entry chunk % N."""
         e, b, j = self.lanes, self.builder, self.job
         entry, part = b.urem(chunk, j.entries), b.udiv(chunk, j.entries)
@@ -110,8 +117,9 @@ class _Program:
         volume = e.advance(j.coefficients, b.mul(entry, j.coefficients_entry), self.storage.raw)
         with e.repeat(first, last, BLOCK) as block:
             end = e.smaller(b.add(block, I64(BLOCK)), last)
+            located = points if placed is None else placed.block(points, block, end)
             with e.repeat(block, end) as pack:
-                self._write_location(pack, b.sub(pack, block), points, volume)
+                self._write_location(pack, b.sub(pack, block), located, volume)
             with e.repeat(block, end) as pack:
                 self._write_sums(pack, b.sub(pack, block), rows, gradient)
 
@@ -158,6 +166,42 @@ class _Program:
         """Address of a lane in an array of packs."""
         index = self.builder.add(self.builder.mul(pack, I64(self.lanes.count)), I64(lane))
         return self.lanes.advance(packs, index, element)
+
+
+class _Placed:
+    """Points of a block after a program of `folding` has placed them, if the job names one. Make it before any loop.
+
+    The program works on a copy of its job, which tells it of one block after the other.
+    """
+
+    def __init__(self, lanes: Lanes, told: SimpleNamespace) -> None:
+        self.lanes, self.builder, self.told = lanes, lanes.builder, told
+        self.asked = self.builder.icmp_unsigned("!=", self.builder.ptrtoint(told.place, I64), I64(0))
+        self.located = lanes.reserve(lanes.number, BLOCK * 3 * lanes.count)
+        self.own = lanes.reserve(I64, len(folding.FIELDS))
+        with self.builder.if_then(self.asked):
+            lanes.copy(self.own, told.placing, I64(8 * len(folding.FIELDS)))
+            self._field("located", POINTER).value = self.located
+
+    def _field(self, name: str, kind: ir.Type = I64) -> Variable:
+        return self.lanes.at(self.lanes.advance(self.own, I64(list(folding.FIELDS).index(name)), I64), kind)
+
+    def block(self, points: Value, block: Value, end: Value) -> Value:
+        """Where the points of packs `block` to `end` are located, as an address of point 0."""
+        e, b = self.lanes, self.builder
+        first, last = (b.mul(pack, I64(e.count)) for pack in (block, end))
+        with b.if_then(self.asked):
+            self._field("points", POINTER).value = e.advance(points, b.mul(first, I64(3)), e.number)
+            self._field("count").value = b.sub(e.smaller(last, self.told.count), first)
+            self._field("chunk").value = b.sub(end, block)
+            self._field("next").value, self._field("chunks").value = I64(0), I64(1)
+            frame.call(b, self.told.place, self.own)
+        return b.select(self.asked, e.advance(self.located, b.mul(first, I64(-3)), e.number), points)
+
+    def report(self) -> None:
+        """Say what was met, when all is done."""
+        with self.builder.if_then(self.asked):
+            self.builder.atomic_rmw("or", self.told.met, self._field("met").value, "monotonic")
 
 
 class _Window:

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from filterlab import forking
 from filterlab.ops.differentiable import operators
+from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.gather import gather
 from filterlab.ops.differentiable.place import place
 from filterlab.ops.differentiable.recording import plain
 from filterlab.ops.place import Placed, Placement
 from filterlab.ops.stencil import Stencil
 
-Prepared = Callable[[Tensor], Placed]
+if TYPE_CHECKING:
+    from filterlab.ops.cpu.evaluation import Evaluator
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,28 +38,22 @@ class Evaluation:
     stencil: Stencil
     start: int
     implementation: str
-    _prepared: dict[torch.dtype, Prepared] = field(default_factory=dict, repr=False)
+    _prepared: dict[torch.dtype, Evaluator] = field(default_factory=dict, repr=False)
 
     def __call__(self, points: Tensor) -> Placed:
         """(N, M, 3) -> rows (N, C, J, M), and the sign (N, M, 3) of `ops.place` or None."""
+        if self.implementation == "cpu" and plain(self.coefficients, points):
+            return (self._prepared.get(points.dtype) or self._prepare(points.dtype))(points)
         if torch.compiler.is_compiling():
             return self._compiled(points)
-        if self.implementation == "cpu" and plain(self.coefficients, points):
-            return self._of(points)(points)
         located, sign = place(points, self.placement, self.implementation)
         return gather(self.coefficients, located, self.stencil, self.start, self.implementation), sign
 
-    def _of(self, points: Tensor) -> Prepared:
-        found = self._prepared.get(points.dtype)
-        if found is None:
-            with forking.lock:
-                from filterlab.ops.cpu.evaluation import Evaluator  # it needs llvmlite
-
-            parts = (self.coefficients, self.placement, self.stencil, self.start)
-            found = Evaluator(*parts, points)
-            if found.gather.coefficients.data_ptr() == self.coefficients.data_ptr():  # a copy could become outdated
-                self._prepared[points.dtype] = found
-        return found
+    def _prepare(self, dtype: torch.dtype) -> Evaluator:
+        made = driver("cpu", "evaluation").Evaluator(self.coefficients, self.placement, self.stencil, self.start, dtype)
+        if made.gather.coefficients.data_ptr() == self.coefficients.data_ptr():  # a copy could become outdated
+            self._prepared[dtype] = made
+        return made
 
     def _compiled(self, points: Tensor) -> Placed:
         """By operators of `torch.library`."""
