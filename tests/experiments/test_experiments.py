@@ -155,12 +155,12 @@ def tiny(name, scan):
     }
     configs["recommend_validation"] = {
         "classes": ["waves", "steps"],
-        "each": 2,
+        "each": 1,
         "sizes": [4, 12],
         "scans": [str(scan), {"file": "not_here.nrrd", "optional": True}],
-        "pieces": 3,
+        "pieces": 1,
         "boundaries": 1,
-        "budgets": 2,
+        "budgets": 1,
         "points": 200,
         "seconds": 0.01,
     }
