@@ -155,12 +155,12 @@ def tiny(name, scan):
     }
     configs["recommend_validation"] = {
         "classes": ["waves", "steps"],
-        "each": 1,
+        "each": 2,
         "sizes": [4, 12],
         "scans": [str(scan), {"file": "not_here.nrrd", "optional": True}],
-        "pieces": 1,
+        "pieces": 3,
         "boundaries": 1,
-        "budgets": 1,
+        "budgets": 2,
         "points": 200,
         "seconds": 0.01,
     }
