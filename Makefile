@@ -14,7 +14,7 @@ demo: $(VENV)/.installed
 
 # one thread a worker: the workers already share the cores
 test: $(VENV)/.installed
-	OMP_NUM_THREADS=1 $(RUN) -m pytest -n $(WORKERS)
+	OMP_NUM_THREADS=1 $(RUN) -m pytest -n $(WORKERS) --dist worksteal
 
 check: $(VENV)/.installed-dev
 	$(RUN) -m ruff check .

@@ -10,12 +10,15 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 
 with warnings.catch_warnings():  # torch's own forward mode compiles these with a deprecated call, once, at first use
     warnings.simplefilter("ignore", DeprecationWarning)
     import torch._decomp.decompositions_for_jvp
 
 torch.set_num_threads(1)
+settings.register_profile("tests", derandomize=True, database=None, deadline=None)
+settings.load_profile("tests")
 
 _BY_A_WORKER = "PYTEST_XDIST_WORKER" in os.environ
 

@@ -101,6 +101,12 @@ def assert_a_nan_stays_on_its_lines(along: Callable[[Tensor, int], Tensor], x: T
         assert torch.equal(found, expected)
 
 
+def mixed(*parts: Tensor) -> Tensor:
+    """One number that depends on every entry with a weight of its own, between 1 and 3."""
+    entries = torch.cat([part.reshape(-1) for part in parts])
+    return (entries * (2 + torch.cos(torch.arange(len(entries), dtype=entries.dtype)))).sum()
+
+
 def finite_difference(function: Callable[[Tensor], Tensor], points: Tensor, step: float = 1e-3) -> Tensor:
     """d function / d point by the fourth-order difference (8 (f₁ − f₋₁) − (f₂ − f₋₂)) / 12h: `(..., 3)`."""
     columns = []

@@ -19,8 +19,8 @@ from filterlab.volume import Boundary
 
 SHAPE = (6, 5, 7)
 SAMPLES = 2 * torch.rand(SHAPE, generator=torch.Generator().manual_seed(7)) - 1
-some = settings(deadline=None, max_examples=40)
-few = settings(deadline=None, max_examples=20)
+some = settings(deadline=None, max_examples=30)
+few = settings(deadline=None, max_examples=12)
 
 bits = st.integers(0, 2**32 - 1).map(lambda i: struct.unpack("<f", struct.pack("<I", i))[0])  # NaN and ±inf too
 near = st.floats(-20, 20, width=32) | st.integers(-40, 40).map(lambda i: i / 2)

@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
+from operator import attrgetter
 
 import pytest
 
 from experiments.extremes import CASES, document
 from experiments.extremes.contract import Case, Finding, Subject, Tally, random_numbers
 
-BY_CASE = [(case, subject) for case in CASES.values() for subject in case.subjects()]
+
+def in_pairs(subjects: list[Subject]) -> list[Subject]:
+    """Some of a sweep, with every pair of its methods, schemes and boundaries; `stability` sweeps them all."""
+    schemes: dict[str, list[str]] = {}
+    for s in subjects:
+        schemes.setdefault(s.method, list(dict.fromkeys(o.scheme for o in subjects if o.method == s.method)))
+    methods, boundaries = list(schemes), list(dict.fromkeys(s.boundary for s in subjects))
+
+    def turn(s: Subject) -> str:
+        offered = schemes[s.method]
+        return offered[(methods.index(s.method) + boundaries.index(s.boundary)) % len(offered)]
+
+    return [s for s in subjects if s.scheme == turn(s)] if len(boundaries) > 1 else subjects
+
+
+BY_CASE = [(case, subject) for case in CASES.values() for subject in in_pairs(case.subjects())]
 
 
 @pytest.mark.parametrize(("case", "subject"), BY_CASE, ids=[f"{case.key}-{subject.key}" for case, subject in BY_CASE])
@@ -68,6 +85,14 @@ def test_a_sweep_leaves_out_what_a_method_does_not_offer() -> None:
     assert Subject("mitchell", "sampled") not in found
     assert Subject("notch", "sampled") in found
     assert Case("y", "", "", lambda *_: Finding(1, 0, 0)).subjects() == [Subject()]
+
+
+def test_every_pair_of_a_sweep_is_tested() -> None:
+    for case in CASES.values():
+        every, some = case.subjects(), in_pairs(case.subjects())
+        for parts in combinations(("method", "scheme", "boundary", "device"), 2):
+            pair = attrgetter(*parts)
+            assert set(map(pair, some)) == set(map(pair, every)), (case.key, parts)
 
 
 # --- the documentation ------------------------------------------------------------------------------------------------

@@ -114,10 +114,10 @@ FOUND = {
 @pytest.mark.parametrize("degree", range(1, 10))
 def test_between_ends_of_opposite_signs_there_is_a_root(degree, dtype):
     """However wide the scale of the coefficients: near either end several of them may lie between two floats."""
-    sign = torch.where(torch.rand(40_000, degree + 1) < 0.5, -1.0, 1.0).double()
+    sign = torch.where(torch.rand(10_000, degree + 1) < 0.5, -1.0, 1.0).double()
     sign[:, -1] = -sign[:, 0]
     top = 25 if dtype == torch.float32 else 200
-    c = (sign * 10 ** ((2 * torch.rand(40_000, degree + 1, dtype=torch.float64) - 1) * top)).to(dtype)
+    c = (sign * 10 ** ((2 * torch.rand(10_000, degree + 1, dtype=torch.float64) - 1) * top)).to(dtype)
     c = torch.cat((c, c.abs().sort(1).values * (-1.0) ** torch.arange(degree + 1).to(dtype)))  # falls by orders
     opposite = c[:, 0].sign() * c[:, -1].sign() < 0
     assert (first_root(c[opposite]) <= 1).all()
@@ -222,21 +222,21 @@ def test_a_touch_counts_once_and_a_gap_does_not(degree, dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("bad", [math.nan, INF, -INF])
 @pytest.mark.parametrize("degree", range(1, 10))
-def test_what_is_no_number_has_no_root_and_leaves_others_alone(degree, bad, dtype):
+def test_what_is_no_number_has_no_root_and_leaves_others_alone(degree, dtype):
     c = made("random", degree, 50, dtype, seed=9)
     alone, alone_all = first_root(c), all_roots(c).t
-    for place in range(degree + 1):
-        broken = c.clone()
-        broken[10, place] = bad
-        broken[11] = bad
-        t, every = first_root(broken), all_roots(broken)
-        assert t[10] == t[11] == INF
-        assert every.count[10:12].tolist() == [0, 0]
-        keep = torch.arange(50) // 10 != 1
-        assert torch.equal(t[keep], alone[keep])
-        assert torch.equal(every.t[keep], alone_all[keep])
+    broken = c.repeat(3, degree + 1, 1, 1)
+    for kind, bad in enumerate((math.nan, INF, -INF)):
+        for place in range(degree + 1):
+            broken[kind, place, 10, place] = bad
+            broken[kind, place, 11] = bad
+    t, every = first_root(broken), all_roots(broken)
+    assert (t[..., 10:12] == INF).all()
+    assert (every.count[..., 10:12] == 0).all()
+    keep = torch.arange(50) // 10 != 1
+    assert torch.equal(t[..., keep], alone[keep].expand_as(t[..., keep]))
+    assert torch.equal(every.t[..., keep, :], alone_all[keep].expand_as(every.t[..., keep, :]))
 
 
 @pytest.mark.parametrize(
@@ -247,11 +247,10 @@ def test_a_power_of_two_changes_no_bit(degree, dtype, powers):
     c = torch.cat([made(f, degree, 20, dtype) for f in ("random", "near-double", "root-at-end") if degree > 1] or
                   [made("random", 1, 60, dtype)])  # fmt: skip
     c = torch.where(c.abs() < 1e-4, 0, c)  # nothing that a factor takes below the normal numbers
-    for power in powers:
-        scaled = c * 2.0 ** (power // 2) * 2.0 ** (power - power // 2)
-        assert torch.equal(first_root(scaled), first_root(c))
-        assert torch.equal(all_roots(scaled).t, all_roots(c).t)
-        assert torch.equal(first_root(-scaled), first_root(c))
+    scaled = torch.stack([c * 2.0 ** (power // 2) * 2.0 ** (power - power // 2) for power in powers])
+    first, every = first_root(torch.cat((scaled, -scaled))), all_roots(scaled).t
+    assert torch.equal(first, first_root(c).expand_as(first))
+    assert torch.equal(every, all_roots(c).t.expand_as(every))
 
 
 @pytest.mark.parametrize("degree", range(1, 10))

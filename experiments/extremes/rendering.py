@@ -240,6 +240,7 @@ CASES = (
         constant_medium,
         SWEEP,
         6,
+        tested=0.05,
     ),
     Case(
         "many-steps",

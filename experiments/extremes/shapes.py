@@ -46,25 +46,31 @@ def nothing(subject: Subject, random: np.random.Generator, amount: float) -> Fin
 def small_axes(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
     """Axes of one and two voxels: interpolated where the method promises it, constant along one voxel."""
     tally = Tally(1e-5)
-    facts = fl.METHODS[subject.method].facts
+    interpolating = fl.METHODS[subject.method].facts.interpolating
     for shape in product((1, 2, 5), repeat=3):
         if min(shape) > 2:
             continue
         samples = torch.tensor(random.uniform(-1, 1, shape), dtype=torch.float32, device=subject.device)
-        field = field_of(subject, samples)
         grid = torch.stack(torch.meshgrid(*(torch.arange(float(n)) for n in shape), indexing="ij"), -1).flip(-1)
-        if facts.interpolating:
-            tally.error(largest(field(grid.to(subject.device)) - samples), f"samples of {shape}", samples.numel())
-        if subject.boundary == "zeros":
-            far = points_inside(random, 20, subject.device).sign() * 1000
-            tally.error(largest(field(far)), f"outside of {shape} is not 0", 20)
-            continue
         points = points_inside(random, 50, subject.device)
-        for axis in (a for a in range(3) if shape[2 - a] == 1):
-            moved = points.clone()
-            moved[:, axis] = torch.tensor(random.uniform(-9, 9, 50), dtype=torch.float32)
-            tally.error(largest(field(points) - field(moved)), f"constant along one voxel of {shape}", 50)
+        moved = [_moved(points, axis, random) for axis in range(3) if shape[2 - axis] == 1]
+        far = points[:20].sign() * 1000
+        asked = [grid.reshape(-1, 3).to(subject.device), far, points, *moved]
+        on_grid, outside, here, *there = field_of(subject, samples)(torch.cat(asked)).split([len(x) for x in asked])
+        if interpolating:
+            tally.error(largest(on_grid - samples.flatten()), f"samples of {shape}", samples.numel())
+        if subject.boundary == "zeros":
+            tally.error(largest(outside), f"outside of {shape} is not 0", 20)
+            continue
+        for other in there:
+            tally.error(largest(here - other), f"constant along one voxel of {shape}", 50)
     return tally.finding()
+
+
+def _moved(points: Tensor, axis: int, random: np.random.Generator) -> Tensor:
+    moved = points.clone()
+    moved[:, axis] = torch.tensor(random.uniform(-9, 9, len(points)), dtype=torch.float32)
+    return moved
 
 
 # --- layouts ----------------------------------------------------------------------------------------------------------

@@ -10,10 +10,11 @@ import time
 import pytest
 import torch
 
+from experiments import registry
 from experiments.__main__ import main
 from experiments.config import ExperimentConfig
-from experiments.report.page import picture
-from experiments.runs import Run, RunError, _commit, config_hash, read_provenance, read_records, run_folder
+from experiments.report.page import Section, picture
+from experiments.runs import Run, RunError, Unit, _commit, config_hash, read_provenance, read_records, run_folder
 
 START = {"started": "2026-01-01T00:00:00+00:00"}
 
@@ -34,37 +35,50 @@ def opened(folder, **changes):
 
 # Units that take a while: killed in the middle, resumed, and never done twice.
 SLOW = """
-import signal, sys, time
+import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the background inherits that it is ignored
-from experiments import registry, __main__
-from experiments.report.page import Section
-from tests.experiments.test_runs import Config
-from experiments.runs import Unit
-
-def compute(config, unit, run):
-    with open(sys.argv[1], "a") as journal:
-        journal.write(unit.key + "\\n")
-    time.sleep(0.1)
-    import torch
-    return {"files": [run.save_array(unit.key, torch.arange(3.0))]}
-
-units = lambda config: [Unit(str(i), str(i)) for i in range(config.count)]
-registry.EXPERIMENTS["counting"] = registry.Experiment(
-    "counting", Config, units, compute, lambda *_: Section("counting"))
+from experiments import __main__
+from tests.experiments import test_runs
+test_runs.count_slowly(sys.argv[1], 0.1)
 sys.exit(__main__.main(sys.argv[2:]))
 """
 
 
+def count_slowly(journal, seconds):
+    """Registers an experiment whose units write their name into the journal and take so long."""
+
+    def compute(config, unit, run):
+        with open(journal, "a") as file:
+            file.write(unit.key + "\n")
+        time.sleep(seconds)
+        return {"files": [run.save_array(unit.key, torch.arange(3.0))]}
+
+    def units(config):
+        return [Unit(str(i), str(i)) for i in range(config.count)]
+
+    registry.EXPERIMENTS["counting"] = registry.Experiment(
+        "counting", Config, units, compute, lambda *_: Section("counting")
+    )
+
+
 @pytest.fixture
-def slow(tmp_path, command):
+def slow(tmp_path, command, monkeypatch, capsys):
+    """A process that counts, and what goes on with its run in this process: None -> what was told."""
     path = tmp_path / "slow.yaml"
     path.write_text("experiment: counting\ndescription: counts slowly\ncount: 30\n")
     journal = tmp_path / "journal"
+    arguments = ["run", path, "--runs", tmp_path / "runs"]
+    monkeypatch.setattr(registry, "EXPERIMENTS", dict(registry.EXPERIMENTS))
 
     def start(code=SLOW):
-        return command(journal, "run", path, "--runs", tmp_path / "runs", code=code)
+        return command(journal, *arguments, code=code)
 
-    return start, journal, tmp_path / "runs"
+    def go_on():
+        count_slowly(journal, 0.0)
+        assert main([str(a) for a in arguments]) == 0
+        return capsys.readouterr().err
+
+    return start, go_on, journal, tmp_path / "runs"
 
 
 def wait_for(journal, lines, process):
@@ -77,7 +91,7 @@ def wait_for(journal, lines, process):
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_stopped_run_resumes_where_it_stopped(slow, how):
-    start, journal, runs = slow
+    start, go_on, journal, runs = slow
     process = start()
     wait_for(journal, 4, process)
     process.send_signal(how)
@@ -90,8 +104,7 @@ def test_a_stopped_run_resumes_where_it_stopped(slow, how):
     kept, _ = read_records(folder)
     assert 3 <= len(kept) < 30
     before = (folder / "records.jsonl").read_bytes()
-    _, errors = start().communicate(timeout=60)
-    assert f"{len(kept)} of 30 units of work are done already" in errors
+    assert f"{len(kept)} of 30 units of work are done already" in go_on()
     records, _ = read_records(folder)
     assert list(records) == [str(i) for i in range(30)]
     assert (folder / "records.jsonl").read_bytes().startswith(before[: before.rindex(b"\n") + 1])
@@ -385,7 +398,7 @@ def test_a_record_that_does_not_fit_leaves_no_half_line(tmp_path, monkeypatch):
 
 def test_a_full_disk_keeps_what_was_finished(slow):
     """A limit on the size of files stands for the disk: writing fails in the middle of a record."""
-    start, _, runs = slow
+    start, go_on, _, runs = slow
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900)); sys.exit("
     process = start(code=SLOW.replace("sys.exit(", limit))
     _, errors = process.communicate(timeout=60)
@@ -395,9 +408,7 @@ def test_a_full_disk_keeps_what_was_finished(slow):
     (folder,) = runs.iterdir()
     kept = len(read_records(folder)[0])
     assert 0 < kept < 30
-    process = start()
-    process.communicate(timeout=60)
-    assert process.returncode == 0
+    go_on()
     assert len(read_records(folder)[0]) == 30
 
 

@@ -99,9 +99,9 @@ direction = torch.nn.functional.normalize(2.0 - entry.nan_to_num(0).clamp(-9, 9)
 rays = len(entry)
 length = torch.full((rays,), 2.0, dtype=torch.float64)
 x = torch.linspace(0, 1, 5)
-for dtype, stored, at_end, room in itertools.product(
-    (torch.float32, torch.float64), (torch.float32, torch.float64, torch.uint8), (True, False), (0, 1)
-):
+single, double = torch.float32, torch.float64
+types = (single, single), (single, torch.uint8), (double, double), (double, single)
+for (dtype, stored), at_end, room in itertools.product(types, (True, False), (0, 1)):
     samples = torch.rand(5 * 5 * 5 + room).mul(1 if stored.is_floating_point else 100).to(stored)
     volume = guarded(samples, at_end)[:125].view(5, 5, 5)
     assert has_room(volume) == bool(room)

@@ -61,7 +61,9 @@ def assert_volume_agrees(x: Tensor, prefilter: str | Prefilter, boundary: str = 
 def test_equals_the_reference(name: str, boundary: Boundary, device: str) -> None:
     """Every prefilter under every boundary, along both kinds of lines."""
     cases = [((2, 3), torch.float64, 5), ((STEPS + 1, 2), torch.float32, 0)]
-    if device == "cuda":  # the interpreter takes its time
+    if device == "cpu":  # the interpreter takes its time: one or the other
+        cases = [cases[(FILTERS.index(name) + list(Boundary).index(boundary)) % 2]]
+    else:
         cases += [((n, 3), dtype, tail) for n in LENGTHS for dtype in TOLERANCE for tail in (0, 1, 20)]
     for shape, dtype, tail in cases:
         x = values(*shape, dtype=dtype, device=device)
@@ -91,7 +93,8 @@ def test_coefficients_are_the_infinite_deconvolution_tails_included(n: int, devi
 @pytest.mark.parametrize("shape", [(1, 2, 3), (2, BLOCK + 1, 3), (2, 2, 3, 1, 4), (3, 2, BLOCK)], ids=str)
 def test_any_number_of_lines_of_a_volume_or_a_batch(shape: tuple[int, ...], device: str) -> None:
     assert_volume_agrees(values(*shape, device=device), "cubic", "border", 2)
-    assert_volume_agrees(values(*shape, device=device), "cubic")
+    if device == "cuda" or math.prod(shape) < 10:
+        assert_volume_agrees(values(*shape, device=device), "cubic")
 
 
 @pytest.mark.parametrize("degree", [7, 9])
@@ -195,7 +198,7 @@ def test_nothing_outside_the_arrays_is_read_or_written(shape: tuple[int, ...], d
 @every_boundary
 def test_derivatives_of_first_and_second_order_and_forwards(boundary: Boundary, device: str) -> None:
     x, y = (values(2, 3, 2, device=device) * factor for factor in (1.0, 0.3))
-    for dim in (1, 2):
+    for dim in (1, 2) if device == "cuda" else [1 + list(Boundary).index(boundary) % 2]:
         results = []
         for implementation in ("cuda", "reference"):
 
@@ -242,7 +245,7 @@ def test_vmap_equals_a_loop(boundary: str, device: str) -> None:
     def gradient(v: Tensor) -> Tensor:
         return torch.func.grad(lambda v: filtered(v).pow(3).sum())(v)
 
-    for dim in (0, 2):
+    for dim in (0, 2) if device == "cuda" else [0 if boundary == "mirror" else 2]:
         for function in (filtered, gradient):
             mapped = torch.func.vmap(function, in_dims=dim)(x)
             assert_same(mapped, torch.stack([function(v) for v in x.unbind(dim)]))

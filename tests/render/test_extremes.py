@@ -23,8 +23,8 @@ SCHEMES = ("direct", "fused")
 EPS = {torch.float32: 2.0**-23, torch.float64: 2.0**-52}
 RGB = (1.0, 0.5, 0.25)
 N = 12
-some = settings(deadline=None, max_examples=50)
-few = settings(deadline=None, max_examples=15)
+some = settings(deadline=None, max_examples=30)
+few = settings(deadline=None, max_examples=10)
 
 
 samples = torch.rand(N, N, N, generator=torch.Generator().manual_seed(3))
@@ -117,7 +117,7 @@ def test_a_hundred_thousand_steps(scheme: str) -> None:
         alpha = torch.tensor(opacity, dtype=torch.float64, requires_grad=scheme == "fused")
         volume = torch.full((N, N, N), 0.5, dtype=torch.float64, requires_grad=scheme == "fused")
         field = reconstruct(volume, "triquadratic", scheme=scheme)
-        step = 1e-4 if scheme == "fused" else 1e-3  # the plain one takes 30 times as long
+        step = 1e-4 if scheme == "fused" else 5e-3  # the plain one takes 30 times as long
         image = render(field, transfer=medium(alpha), step=step, dtype=torch.float64, **along(10.0))[0]
         value, slope = closed_form(opacity, 10.0)
         assert image[3].item() == pytest.approx(value, rel=1e-12, abs=0)

@@ -8,10 +8,11 @@ graph that is stored on disk must find its stencil again.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from fractions import Fraction
 from functools import lru_cache
+from typing import TypeVar
 
-import torch
 from torch import Tensor
 from torch.library import custom_op
 
@@ -22,8 +23,16 @@ from filterlab.ops.place import Placement
 from filterlab.ops.stencil import Product, Stencil
 from filterlab.volume import Boundary, Geometry
 
+_Function = TypeVar("_Function", bound=Callable[..., str])
 
-@torch.compiler.assume_constant_result
+
+def _constant(function: _Function) -> _Function:
+    """As `torch.compiler.assume_constant_result`, which imports torch's compiler: as long as torch itself takes."""
+    function._dynamo_marked_constant = True  # type: ignore[attr-defined]
+    return function
+
+
+@_constant
 def stencil_text(stencil: Stencil) -> str:
     """The stencil as JSON; `stencil_of` is the inverse."""
     kernels = list(dict.fromkeys(k for row in stencil.rows for p in row for k in p.kernels))
@@ -47,7 +56,7 @@ def stencil_of(text: str) -> Stencil:
     )
 
 
-@torch.compiler.assume_constant_result
+@_constant
 def placement_text(placement: Placement) -> str:
     """The placement as JSON; `placement_of` is the inverse."""
     g = placement.geometry
