@@ -48,8 +48,8 @@ def _curves(study: Study, index: int, errors: Mapping[tuple[str, int], Record], 
     with plots.settings():
         figure = plots.canvas(10.4, 4.6)
         left, right = figure.subplots(1, 2)
-        _panel(left, study, errors, "value_rms", "RMS error of the value")
-        _panel(right, study, errors, "gradient_rms", "RMS error of the gradient")
+        panel(left, study, errors, "value_rms", "RMS error of the value")
+        panel(right, study, errors, "gradient_rms", "RMS error of the gradient")
         plots.legend_right(right)
         drawn = plots.svg(figure, f"rms-{index}")
     caption = (
@@ -63,8 +63,9 @@ def _curves(study: Study, index: int, errors: Mapping[tuple[str, int], Record], 
     return Plot(drawn, caption)
 
 
-def _panel(axes: Axes, study: Study, errors: Mapping[tuple[str, int], Record], quantity: str, title: str) -> None:
-    for recipe in _recipes(errors):
+def panel(axes: Axes, study: Study, errors: Mapping[tuple[str, int], Record], quantity: str, title: str) -> None:
+    """Curves of one quantity of records, by recipe and resolution."""
+    for recipe in recipes(errors):
         found = [errors[recipe, n] for n in study.resolutions if (recipe, n) in errors]
         found = [r for r in found if r[quantity]]
         if not found:
@@ -76,7 +77,8 @@ def _panel(axes: Axes, study: Study, errors: Mapping[tuple[str, int], Record], q
     axes.set_title(title)
 
 
-def _recipes(errors: Mapping[tuple[str, int], Record]) -> list[str]:
+def recipes(errors: Mapping[tuple[str, int], Record]) -> list[str]:
+    """Those that there are records of, in their order."""
     return list(dict.fromkeys(recipe for recipe, _ in errors))
 
 
@@ -85,7 +87,7 @@ def _numbers(study: Study, errors: Mapping[tuple[str, int], Record]) -> Table:
     for n in study.resolutions:
         columns += [Column(f"{n}³", "value"), Column("", "gradient")]
     rows = []
-    for recipe in _recipes(errors):
+    for recipe in recipes(errors):
         found = [errors.get((recipe, n)) for n in study.resolutions]
         name = label(next(r for r in found if r))
         pairs = [(text(r["value_rms"]), text(r["gradient_rms"])) if r else (MISSING, MISSING) for r in found]
