@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.report import plots
 from experiments.report.page import Block, Column, Plot, Section, Table
-from experiments.report.rms_error import panel, recipes
+from experiments.report.rms_error import Errors, curves, of_study, recipes
 from experiments.report.style import MISSING, fixed, label, text
 from experiments.runs import Record
 
@@ -32,9 +31,7 @@ def draw(config: Config, records: Mapping[str, Record], _folder: Path) -> Sectio
 
 
 def _study(config: Config, study: Study, index: int, records: Mapping[str, Record]) -> Section:
-    chosen = [r for r in records.values() if r["study"] == index]
-    errors = {(r["recipe"], r["resolution"]): r for r in chosen if r["kind"] == "error"}
-    fits = [r for r in chosen if r["kind"] == "fit"]
+    errors, fits = of_study(index, records)
     blocks: list[Block] = []
     if errors:
         blocks += [_curves(config, study, index, errors), _numbers(study, errors)]
@@ -43,14 +40,12 @@ def _study(config: Config, study: Study, index: int, records: Mapping[str, Recor
     return Section(f"{study.signal.label}, level {study.level:g}", (), blocks)
 
 
-def _curves(config: Config, study: Study, index: int, errors: Mapping[tuple[str, int], Record]) -> Plot:
-    with plots.settings():
-        figure = plots.canvas(10.4, 4.6)
-        left, right = figure.subplots(1, 2)
-        panel(left, study, errors, "distance_rms", "RMS error of the hit's distance")
-        panel(right, study, errors, "normal_rms", "RMS angle of the normal, radians")
-        plots.legend_right(right)
-        drawn = plots.svg(figure, f"hits-{index}")
+def _curves(config: Config, study: Study, index: int, errors: Errors) -> Plot:
+    titles = {
+        "distance_rms": "RMS error of the hit's distance",
+        "normal_rms": "RMS angle of the normal, radians",
+    }
+    drawn = curves(study, errors, titles, f"hits-{index}")
     some = next(iter(errors.values()))
     caption = (
         f"Level {study.level:g} of {study.signal.label}, boundary {config.boundary}, float64; {some['rays']:,} rays "
@@ -63,7 +58,7 @@ def _curves(config: Config, study: Study, index: int, errors: Mapping[tuple[str,
     return Plot(drawn, caption)
 
 
-def _numbers(study: Study, errors: Mapping[tuple[str, int], Record]) -> Table:
+def _numbers(study: Study, errors: Errors) -> Table:
     columns = [Column("method", numeric=False)]
     for n in study.resolutions:
         columns += [Column(f"{n}³", "distance"), Column("", "normal"), Column("", "elsewhere")]
