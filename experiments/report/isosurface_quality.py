@@ -88,25 +88,19 @@ def _zoom_caption(zoom: Zoom) -> str:
 
 
 def _numbers(figure: Figure, records: Sequence[Record]) -> Table:
+    """Of a scan no distances: it has no surface of its own."""
+    known = figure.signal is not None
+    distances = [Column("distance", "median, voxels"), Column("", "95 %, voxels")] if known else []
     columns = [
         Column("method", numeric=False),
         Column("pixels hit", "%"),
-        Column("distance", "median, voxels"),
-        Column("", "95 %, voxels"),
+        *distances,
         Column("build", "s"),
         Column("picture", "s"),
     ]
     rows = []
     for r in records:
-        hit = r.get("hit")
-        rows.append(
-            [
-                _name(figure, r),
-                MISSING if hit is None else fixed(100 * hit),
-                text(r.get("distance_median")),
-                text(r.get("distance_most")),
-                fixed(r["build_seconds"]),
-                fixed(r["render_seconds"], 1),
-            ]
-        )
+        off = [text(r.get("distance_median")), text(r.get("distance_most"))] if known else []
+        hit = MISSING if r.get("hit") is None else fixed(100 * r["hit"])
+        rows.append([_name(figure, r), hit, *off, fixed(r["build_seconds"]), fixed(r["render_seconds"], 1)])
     return Table(columns, rows, "The whole view. Wall-clock seconds on the CPU depend on what else ran.")

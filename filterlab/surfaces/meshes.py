@@ -32,7 +32,7 @@ from filterlab.fields.base import Domain
 from filterlab.surfaces.base import Surface
 
 NODES_AT_ONCE = 1 << 22  # of the grid
-NODE_BYTES = 40  # that each takes while it is looked at, about
+NODE_BYTES = 60  # that each takes while it is looked at, at most about
 BYTES_OF_TRIANGLE = 48  # of a mesh: three numbers, and half a vertex with its normal
 MAX_PLANE = 1 << 26  # grid points of one layer
 _POINTS = 1 << 18  # at a time
