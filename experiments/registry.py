@@ -31,6 +31,8 @@ _NAMES = (
     "recommend_validation",
     "stability",
     "root_finding",
+    "hit_error",
+    "isosurface_quality",
     "demo",
 )
 

@@ -38,6 +38,16 @@ def _part(window: list[float]) -> list[float]:
 Window = Annotated[list[float], Field(min_length=4, max_length=4), AfterValidator(_part)]
 
 
+def magnified(camera: scene.CameraView, window: list[float] | None) -> scene.CameraView:
+    """A camera that sees the part of a view in a window (left, top, right, bottom; 0 … 1 of it), at full size."""
+    if window is None:
+        return camera
+    left, top, right, bottom = camera.window
+    width, height = right - left, bottom - top
+    inner = (left + window[0] * width, top + window[1] * height, left + window[2] * width, top + window[3] * height)
+    return camera.model_copy(update={"window": inner})
+
+
 class Progress(Protocol):
     """What an image tells how far it is; a `Run` is one."""
 
@@ -77,12 +87,7 @@ class View(StrictModel):
 
     def through(self, window: list[float] | None) -> View:
         """The part of this view in a window (left, top, right, bottom; 0 … 1 of this view), at full size."""
-        if window is None:
-            return self
-        left, top, right, bottom = self.camera.window
-        width, height = right - left, bottom - top
-        inner = (left + window[0] * width, top + window[1] * height, left + window[2] * width, top + window[3] * height)
-        return self.model_copy(update={"camera": self.camera.model_copy(update={"window": inner})})
+        return self.model_copy(update={"camera": magnified(self.camera, window)})
 
     def check(self, domain: Domain, path: str, *, compared: bool = False) -> None:
         """Raises ConfigError, for the key of the view at `path`, where an image of a field there can't be drawn.

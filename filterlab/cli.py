@@ -1,4 +1,4 @@
-"""The command `filterlab`: render | resample | recommend | methods | info.
+"""The command `filterlab`: render | mesh | resample | recommend | methods | info.
 
 Exit codes: 0 done, 1 a mistake in what was asked (a message on stderr), 2 a command line that makes no sense,
 3 `recommend` found nothing within the budget, 130 interrupted.
@@ -16,7 +16,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Union
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import torch
 
     from filterlab.io.bounded import VolumeHeader
+    from filterlab.scenes.model import Scene
     from filterlab.volume import Volume
 
 OK, FAILED, USAGE, NOTHING_FITS, INTERRUPTED = 0, 1, 2, 3, 130
@@ -65,29 +66,20 @@ class Render:
     """Show what the picture would take, and what the scene leaves out; no picture is made."""
 
     def run(self, overrides: dict[str, str]) -> None:
-        if self.explain == (self.output is not None):
-            raise UsageError("expected either -o FILE.png or --explain; got " + ("both" if self.explain else "neither"))
+        _check_asked(self.output, self.explain, ".png")
         if self.output is not None:
             self._check_output(self.output)
 
-        from filterlab.scenes.build import load_scene, surface_scene
+        from filterlab.scenes.build import build, render_scene
 
-        level = overrides.pop("level", None)
-        if level is None and self.scene.suffix.lower() not in (".yaml", ".yml", "") and self.scene.is_file():
-            raise ValueError(f"expected a scene, a .yaml file; for the surface in a volume add --level: {self.scene}")
-        scene = load_scene(self.scene, overrides) if level is None else surface_scene(self.scene, level, overrides)
-        if scene.volume is not None and self.output is not None:
-            _check_not_input(self.output, Path(scene.volume.file))
-        _check_device(scene.device)
+        scene = _scene(self.scene, overrides, self.output)
         if self.output is None:
-            from filterlab.scenes.build import build
             from filterlab.scenes.plan import plan
             from filterlab.scenes.plan_report import table
 
             _show(table(plan(build(scene))))
             return
         from filterlab.io.images import save_image
-        from filterlab.scenes.build import render_scene
 
         save_image(render_scene(scene, progress=None), self.output)
 
@@ -98,6 +90,87 @@ class Render:
             raise ValueError(f"expected a picture's name that ends in .png; got {output}")
         check_writable(output)
         _check_not_input(output, self.scene)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Make triangles of the surface at a level in a volume, with vertices exactly on it.
+
+    What is meshed is said as for `filterlab render`: a volume file and --level, or a scene with a surface; any value of
+    the scene can be changed, like --method. Files: .ply, .obj and .stl (pip install 'filterlab[mesh]').
+
+    examples:
+      filterlab mesh engine.nrrd --level 90 -o engine.ply
+      filterlab mesh engine.nrrd --level 90 -o fine.stl --step 0.5 --method notch
+      filterlab mesh surface.yaml -o surface.obj
+      filterlab mesh engine.nrrd --level 90 --explain
+    """
+
+    scene: Annotated[Positional[Path], arg(metavar="VOLUME | SCENE.yaml")]
+    """The volume, with --level; or a scene with a surface."""
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
+    """The mesh to write: a name that ends in .ply, .obj or .stl."""
+    step: float = 1.0
+    """Between the points of the grid that triangles are made on, in voxels."""
+    outside: str = "lower"
+    """Where normals point to: lower values (air in CT), or greater ones."""
+    explain: bool = False
+    """Show what the mesh would take; no mesh is made."""
+
+    def run(self, overrides: dict[str, str]) -> None:
+        from filterlab.io.meshes import check_mesh_file, save_mesh
+
+        _check_asked(self.output, self.explain, ".ply")
+        if self.output is not None:
+            check_mesh_file(self.output)
+            _check_not_input(self.output, self.scene)
+        _check_name("outside", self.outside, ("lower", "greater"))
+        if not 0 < self.step < math.inf:  # a NaN fails too
+            raise ValueError(f"expected --step to be a positive number of voxels; got {self.step:g}")
+
+        from filterlab.scenes.build import PreparedSurface, build
+        from filterlab.scenes.plan import plan_of_mesh
+        from filterlab.scenes.plan_report import table
+        from filterlab.surfaces.meshes import mesh
+
+        scene = _scene(self.scene, overrides, self.output)
+        if scene.surface is None:
+            raise ValueError(f"expected a scene with a surface; this one shows a medium: {self.scene}")
+        prepared = build(scene)
+        assert isinstance(prepared, PreparedSurface)
+        if self.output is None:
+            _show(table(plan_of_mesh(prepared, self.step)))
+            return
+        with _progress_bar() as progress:
+            made = mesh(
+                prepared.surface,
+                self.step,
+                outside=self.outside,  # type: ignore[arg-type]
+                progress=lambda done: progress(done, "meshing"),
+            )
+        if not len(made.faces):
+            print(f"filterlab: no triangles: nothing crosses level {float(prepared.surface.level):g}", file=sys.stderr)
+        save_mesh(made, self.output)
+
+
+def _check_asked(output: Path | None, explain: bool, ending: str) -> None:
+    """Raises UsageError unless a command makes something, or explains what it would make."""
+    if explain == (output is not None):
+        raise UsageError(f"expected either -o FILE{ending} or --explain; got " + ("both" if explain else "neither"))
+
+
+def _scene(path: Path, overrides: dict[str, str], output: Path | None) -> Scene:
+    """The scene in a file; or, with a level among the overrides, that of the surface in a volume."""
+    from filterlab.scenes.build import load_scene, surface_scene
+
+    level = overrides.pop("level", None)
+    if level is None and path.suffix.lower() not in (".yaml", ".yml", "") and path.is_file():
+        raise ValueError(f"expected a scene, a .yaml file; for the surface in a volume add --level: {path}")
+    scene = load_scene(path, overrides) if level is None else surface_scene(path, level, overrides)
+    if scene.volume is not None and output is not None:
+        _check_not_input(output, Path(scene.volume.file))
+    _check_device(scene.device)
+    return scene
 
 
 @dataclass(frozen=True)
@@ -426,11 +499,14 @@ filterlab COMMAND --help tells more, with examples. filterlab --version tells th
 
 COMMANDS: dict[str, Any] = {
     "render": Render,
+    "mesh": Mesh,
     "resample": Resample,
     "recommend": Recommend,
     "methods": Methods,
     "info": Info,
 }
+SHOWING: dict[str, Any] = {"render": Render, "mesh": Mesh}
+"""Those that take a scene, and changes to it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -441,7 +517,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return OK
     overrides: dict[str, str] = {}
     try:
-        if arguments[:1] == ["render"]:
+        if arguments and arguments[0] in SHOWING:
             arguments, overrides = split_overrides(arguments)
         return _parse(arguments or ["--help"]).run(overrides) or OK
     except SystemExit as exit:  # tyro: --help, or usage
@@ -486,17 +562,19 @@ def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]
 
     Raises UsageError for a key that is given twice.
     """
+    own = {f"--{f.name}": f.name == "explain" for f in fields(SHOWING[arguments[0]]) if f.name != "scene"}
     known: list[str] = []
     overrides: dict[str, str] = {}
     rest = list(arguments)
     while rest:
         token = rest.pop(0)
-        if token in ("-o", "--output"):
-            known += [token, *rest[:1]]
-            del rest[:1]
-        elif token == "--explain":
+        name, given, _ = token.partition("=")
+        if token == "-o" or name in own:
             known.append(token)
-        elif token.startswith("--") and len(token) > 2 and token != "--help" and not token.startswith("--output="):
+            if not (given or own.get(name, False)):
+                known += rest[:1]
+                del rest[:1]
+        elif token.startswith("--") and len(token) > 2 and token != "--help":
             key, equals, value = token[2:].partition("=")
             values = [value] if equals else []
             while not equals and rest and not re.match(r"-[-a-zA-Z]", rest[0]):

@@ -229,6 +229,52 @@ def sphere_distance(radius: float = 0.6, center: Corner = (0.0, 0.0, 0.0), voxel
     return Signal("sphere-distance", function, voxel_size=voxel_size)
 
 
+def torus(radius: float = 0.55, tube: float = 0.25, voxel_size: float | None = None) -> Signal:
+    """A torus about the z axis on [−1, 1]³, as the quartic whose zeros it is; negative inside.
+
+    f = (|p|² + R² − r²)² − 4 R² (x² + y²), with R = `radius` of the circle in the middle of the tube, r of the `tube`.
+    It is smooth everywhere, so that level sets of every method show their orders.
+    """
+
+    _require_positive(radius=radius, tube=tube)
+
+    def function(p: Tensor) -> tuple[Tensor, Tensor]:
+        flat = torch.cat((p[..., :2], torch.zeros_like(p[..., 2:])), -1)
+        q = (p * p).sum(-1) + radius * radius - tube * tube
+        value = q * q - 4 * radius * radius * (flat * flat).sum(-1)
+        return value, 4 * q[..., None] * p - 8 * radius * radius * flat
+
+    return Signal("torus", function, voxel_size=voxel_size)
+
+
+def barth_sextic(extent: float = 1.75, voxel_size: float | None = None) -> Signal:
+    """Barth's sextic: its zeros are the surface of degree 6 with most double points, 65 of them, 15 at infinity.
+
+    f = 4 (τ²x² − y²)(τ²y² − z²)(τ²z² − x²) − (1 + 2τ) (x² + y² + z² − 1)²,  τ = (1 + √5) / 2,
+
+    on [−1, 1]³, which stands for x, y, z between ± `extent`. At double points the gradient is 0, and spikes end there.
+
+    Source: Barth, Two projective surfaces with many nodes, admitting the symmetries of the icosahedron, 1996.
+    """
+
+    _require_positive(extent=extent)
+    golden = (1 + math.sqrt(5)) / 2
+
+    def function(p: Tensor) -> tuple[Tensor, Tensor]:
+        q = extent * p
+        squares = q * q
+        following = squares.roll(-1, -1)  # y², z², x²
+        factors = golden**2 * squares - following
+        others = factors.roll(-1, -1) * factors.roll(1, -1)  # of each factor the product of the two others
+        ball = squares.sum(-1, keepdim=True) - 1
+        weight = 1 + 2 * golden
+        value = 4 * factors.prod(-1) - weight * (ball * ball)[..., 0]
+        slopes = 8 * (golden**2 * others - others.roll(1, -1)) - 4 * weight * ball
+        return value, extent * slopes * q
+
+    return Signal("barth-sextic", function, voxel_size=voxel_size)
+
+
 def gaussian(sigma: float = 0.3, center: Corner = (0.0, 0.0, 0.0), voxel_size: float | None = None) -> Signal:
     """exp(−|p − c|² / (2σ²)) on [−1, 1]³: smooth, so that every method shows its order early."""
 
@@ -258,6 +304,8 @@ SIGNALS: dict[str, Callable[..., Signal]] = {
     "franke": franke,
     "sphere": sphere,
     "sphere-distance": sphere_distance,
+    "torus": torus,
+    "barth-sextic": barth_sextic,
     "gaussian": gaussian,
     "plane-wave": plane_wave,
 }

@@ -94,6 +94,33 @@ def test_spheres():
     laws.assert_close(moved(p), np.array([-0.6, 0, math.sqrt(1.36) - 0.6]), 1e-14)
 
 
+def test_torus():
+    """Points of it by its angles; the sign tells inside from outside."""
+    u, v = 7 * torch.rand(2, 50, dtype=torch.float64)
+    ring = 0.5 + 0.2 * torch.cos(v)
+    p = torch.stack((ring * torch.cos(u), ring * torch.sin(u), 0.2 * torch.sin(v)), -1)
+    signal = signals.torus(0.5, 0.2)
+    laws.assert_close(signal(p), np.zeros(50), 1e-15)
+    assert signal(torch.tensor([0.5, 0, 0])) < 0 < signal(torch.zeros(3))
+
+
+def test_barth_sextic():
+    """As printed, its symmetries, and a known double point: (1, 0, 0) scaled to where value and gradient are 0."""
+    p = inside(signals.barth_sextic(), 50)
+    x, y, z = (1.75 * p).T.numpy()
+    t = (1 + 5**0.5) / 2
+    factors = (t**2 * x**2 - y**2) * (t**2 * y**2 - z**2) * (t**2 * z**2 - x**2)
+    expected = 4 * factors - (1 + 2 * t) * (x**2 + y**2 + z**2 - 1) ** 2
+    value = signals.barth_sextic()(p)
+    laws.assert_close(value, expected, 1e-13, np.abs(expected).max())
+    for image in (p.roll(1, -1), p * torch.tensor([1, -1, 1])):
+        laws.assert_close(signals.barth_sextic()(image), value, 1e-13, np.abs(expected).max())
+    node = torch.tensor([1.0, 0, 0], dtype=torch.float64) / 1.75
+    for quantity in signals.barth_sextic().jet(node, 1):
+        laws.assert_close(quantity, np.zeros(quantity.shape), 1e-14)
+    assert torch.linalg.matrix_rank(signals.barth_sextic().jet(node, 2)[2]) == 3  # a cone, not a crease
+
+
 def test_polynomial_with_gradient():
     terms = {(0, 0, 0): 1.0, (1, 2, 0): 2.0, (0, 0, 3): -0.5}
     p = torch.rand(20, 3, dtype=torch.float64)

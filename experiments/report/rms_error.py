@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from markupsafe import Markup
 from matplotlib.axes import Axes
 
 from experiments.report import plots
@@ -15,6 +16,9 @@ from experiments.runs import Record
 
 if TYPE_CHECKING:
     from experiments.rms_error import Config, Study
+
+Errors = Mapping[tuple[str, int], Record]
+"""Records by recipe and resolution."""
 
 LEAD = (
     "Each signal is sampled at cell centres on cubic grids, reconstructed, and compared with itself at uniform random "
@@ -33,9 +37,7 @@ def draw(config: Config, records: Mapping[str, Record], _folder: Path) -> Sectio
 
 
 def _study(config: Config, study: Study, index: int, records: Mapping[str, Record]) -> Section:
-    chosen = [r for r in records.values() if r["study"] == index]
-    errors = {(r["recipe"], r["resolution"]): r for r in chosen if r["kind"] == "error"}
-    fits = [r for r in chosen if r["kind"] == "fit"]
+    errors, fits = of_study(index, records)
     blocks: list[Block] = []
     if errors:
         blocks += [_curves(study, index, errors, config), _numbers(study, errors)]
@@ -44,14 +46,9 @@ def _study(config: Config, study: Study, index: int, records: Mapping[str, Recor
     return Section(study.signal.label, (), blocks)
 
 
-def _curves(study: Study, index: int, errors: Mapping[tuple[str, int], Record], config: Config) -> Plot:
-    with plots.settings():
-        figure = plots.canvas(10.4, 4.6)
-        left, right = figure.subplots(1, 2)
-        _panel(left, study, errors, "value_rms", "RMS error of the value")
-        _panel(right, study, errors, "gradient_rms", "RMS error of the gradient")
-        plots.legend_right(right)
-        drawn = plots.svg(figure, f"rms-{index}")
+def _curves(study: Study, index: int, errors: Errors, config: Config) -> Plot:
+    titles = {"value_rms": "RMS error of the value", "gradient_rms": "RMS error of the gradient"}
+    drawn = curves(study, errors, titles, f"rms-{index}")
     caption = (
         f"Signal {study.signal.label}, {config.points:,} uniform points of the box shrunk to {study.inner:g}, boundary "
         f"{config.boundary}, {config.dtype}. Left: value. Right: gradient, per world unit."
@@ -63,8 +60,26 @@ def _curves(study: Study, index: int, errors: Mapping[tuple[str, int], Record], 
     return Plot(drawn, caption)
 
 
-def _panel(axes: Axes, study: Study, errors: Mapping[tuple[str, int], Record], quantity: str, title: str) -> None:
-    for recipe in _recipes(errors):
+def of_study(index: int, records: Mapping[str, Record]) -> tuple[Errors, list[Record]]:
+    """The errors and the fits of a study."""
+    chosen = [r for r in records.values() if r["study"] == index]
+    errors = {(r["recipe"], r["resolution"]): r for r in chosen if r["kind"] == "error"}
+    return errors, [r for r in chosen if r["kind"] == "fit"]
+
+
+def curves(study: Study, errors: Errors, titles: Mapping[str, str], name: str) -> Markup:
+    """Two quantities against resolution, side by side: {quantity: its title}."""
+    with plots.settings():
+        figure = plots.canvas(10.4, 4.6)
+        panels = figure.subplots(1, 2)
+        for axes, (quantity, title) in zip(panels, titles.items(), strict=True):
+            _panel(axes, study, errors, quantity, title)
+        plots.legend_right(panels[-1])
+        return plots.svg(figure, name)
+
+
+def _panel(axes: Axes, study: Study, errors: Errors, quantity: str, title: str) -> None:
+    for recipe in recipes(errors):
         found = [errors[recipe, n] for n in study.resolutions if (recipe, n) in errors]
         found = [r for r in found if r[quantity]]
         if not found:
@@ -76,16 +91,17 @@ def _panel(axes: Axes, study: Study, errors: Mapping[tuple[str, int], Record], q
     axes.set_title(title)
 
 
-def _recipes(errors: Mapping[tuple[str, int], Record]) -> list[str]:
+def recipes(errors: Errors) -> list[str]:
+    """Those that there are records of, in their order."""
     return list(dict.fromkeys(recipe for recipe, _ in errors))
 
 
-def _numbers(study: Study, errors: Mapping[tuple[str, int], Record]) -> Table:
+def _numbers(study: Study, errors: Errors) -> Table:
     columns = [Column("method", numeric=False)]
     for n in study.resolutions:
         columns += [Column(f"{n}³", "value"), Column("", "gradient")]
     rows = []
-    for recipe in _recipes(errors):
+    for recipe in recipes(errors):
         found = [errors.get((recipe, n)) for n in study.resolutions]
         name = label(next(r for r in found if r))
         pairs = [(text(r["value_rms"]), text(r["gradient_rms"])) if r else (MISSING, MISSING) for r in found]

@@ -2,10 +2,12 @@ from .atomic import atomic_write
 from .bounded import VolumeFileError, VolumeHeader
 from .config import ConfigError, StrictModel, dump_config, load_config
 from .images import load_image, save_image
+from .meshes import MESH_FORMATS, save_mesh
 from .volumes import FORMATS, describe, load_volume, save_volume
 
 __all__ = [
     "FORMATS",
+    "MESH_FORMATS",
     "ConfigError",
     "StrictModel",
     "VolumeFileError",
@@ -17,5 +19,6 @@ __all__ = [
     "load_image",
     "load_volume",
     "save_image",
+    "save_mesh",
     "save_volume",
 ]

@@ -7,6 +7,7 @@ scene ──▶ Prepared ──▶ Frame (dvr.prepare) ──▶ rays, segments,
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -26,9 +27,11 @@ from filterlab.render.fused import FusedMarcher, empty_bricks, why_not_fused
 from filterlab.render.plain import Medium
 from filterlab.scenes.build import Prepared, PreparedSurface
 from filterlab.scenes.model import Scene
+from filterlab.surfaces.meshes import BYTES_OF_TRIANGLE, NODE_BYTES, Grid, mesh
 
 _PROBE_RAYS = 4096
 _PROBE_SEGMENTS = 1 << 21
+_PROBE_NODES = 1 << 17
 _REPEATS = 5
 _DERIVATIVES = ("values", "values and gradients", "values, gradients and Hessians")
 
@@ -119,6 +122,68 @@ class SurfacePlan:
     def data(self) -> dict[str, Any]:
         """Plain data."""
         return asdict(self)
+
+
+@dataclass(frozen=True)
+class MeshPlan:
+    """What making triangles of the surface of a scene takes.
+
+    Attributes:
+        method, scheme, storage, taps, level: as in `SurfacePlan`.
+        step: of the grid, in voxels.
+        size: points of the grid along x, y, z.
+        triangles: about; from those on a coarser grid.
+        residual: the largest |f − level| at a vertex there.
+        volume_bytes, coefficient_bytes, grid_bytes, mesh_bytes: memory; of the grid what is looked at together.
+        seconds: from a few runs on a coarser grid, as if all of it grew as the grid does: at most that.
+        chosen: as in `Plan`.
+    """
+
+    method: str
+    scheme: str
+    storage: str
+    taps: int | None
+    level: float
+    step: float
+    size: tuple[int, int, int]
+    triangles: int
+    residual: float
+    volume_bytes: int
+    coefficient_bytes: int
+    grid_bytes: int
+    mesh_bytes: int
+    seconds: Quartiles
+    chosen: tuple[str, ...] = ()
+
+    def data(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+
+def plan_of_mesh(prepared: PreparedSurface, step: float) -> MeshPlan:
+    """The plan of the mesh of a scene that is built; a coarser one is made, a few times."""
+    surface, domain = prepared.surface, prepared.surface.domain
+    grid = Grid.of(domain, step, surface.device)
+    coarser = max(1.0, (math.prod(grid.size) / _PROBE_NODES) ** (1 / 3))
+    probe = Grid.of(domain, step * coarser, surface.device)
+    made = mesh(surface, step * coarser)
+    share = math.prod(probe.size) / math.prod(grid.size)
+    triangles = round(len(made.faces) * coarser**2)
+    nx, ny, nz = grid.size
+    return MeshPlan(
+        **_described(prepared.field),
+        level=float(surface.level),
+        step=step,
+        size=grid.size,
+        triangles=triangles,
+        residual=made.residual,
+        volume_bytes=prepared.volume_bytes,
+        coefficient_bytes=coefficient_bytes(prepared.field),
+        grid_bytes=NODE_BYTES * nx * ny * (min(grid.layers_at_once, nz - 1) + 1),
+        mesh_bytes=triangles * BYTES_OF_TRIANGLE,
+        seconds=_timed(lambda: mesh(surface, step * coarser).vertices, share),
+        chosen=prepared.chosen,
+    )
 
 
 def plan(prepared: Prepared | PreparedSurface) -> Plan | SurfacePlan:

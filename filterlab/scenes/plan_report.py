@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from rich.table import Table
 from rich.text import Text
 
 from filterlab.recommendation.report import duration, percent, size
-from filterlab.scenes.plan import Plan, SurfacePlan
+from filterlab.scenes.plan import MeshPlan, Plan, SurfacePlan
 
 
-def table(plan: Plan | SurfacePlan) -> Table:
+def table(plan: Plan | SurfacePlan | MeshPlan) -> Table:
     """One line for every decision."""
     shown = Table(show_header=False, box=None)
-    for name, text in _lines_of_surface(plan) if isinstance(plan, SurfacePlan) else _lines(plan):
+    for name, text in _LINES[type(plan)](plan):
         shown.add_row(name, Text(text))
     return shown
 
 
-def _begin(plan: Plan | SurfacePlan) -> list[tuple[str, str]]:
+def _begin(plan: Plan | SurfacePlan | MeshPlan) -> list[tuple[str, str]]:
     taps = "" if plan.taps is None else f", {plan.taps} taps"
     lines = [("method", f"{plan.method} ({plan.scheme}), coefficients as {plan.storage}{taps}")]
     return lines + [("" if i else "chosen", sentence) for i, sentence in enumerate(plan.chosen)]
@@ -52,8 +53,29 @@ def _lines(plan: Plan) -> list[tuple[str, str]]:
     return lines + _end(plan, sizes, "march")
 
 
+def _lines_of_mesh(plan: MeshPlan) -> list[tuple[str, str]]:
+    lines = _begin(plan)
+    lines.append(("grid", " × ".join(map(str, plan.size)) + f" points, a step of {plan.step:g} voxels"))
+    where = f"vertices within {plan.residual:.0e} of level {plan.level:g}"
+    lines.append(("mesh", f"about {plan.triangles:,} triangles, {where}" if plan.triangles else "no triangles"))
+    sizes = (
+        ("volume", plan.volume_bytes),
+        ("coefficients", plan.coefficient_bytes),
+        ("grid", plan.grid_bytes),
+        ("mesh", plan.mesh_bytes),
+    )
+    time = plan.seconds
+    spread = f"{duration(time.low)} … {duration(time.high)}"
+    lines.append(_memory(sizes))
+    return [*lines, ("time", f"at most about {duration(time.median)} ({spread}, from a coarser grid)")]
+
+
+def _memory(sizes: Sequence[tuple[str, int]]) -> tuple[str, str]:
+    return "memory", ", ".join(f"{name} {size(count)}" for name, count in sizes if count)
+
+
 def _end(plan: Plan | SurfacePlan, sizes: Sequence[tuple[str, int]], verb: str) -> list[tuple[str, str]]:
-    lines = [("memory", ", ".join(f"{name} {size(count)}" for name, count in sizes if count))]
+    lines = [_memory(sizes)]
     time = plan.seconds
     spread = f"{duration(time.low)} … {duration(time.high)}"
     lines.append(("time", f"about {duration(time.median)} to {verb} ({spread}, from a small part of the rays)"))
@@ -67,3 +89,10 @@ def _skipping(plan: Plan) -> str:
     if not plan.empty_bricks:
         return "none: every brick of the volume may have some opacity"
     return f"{percent(plan.empty_bricks)} of the bricks; about {percent(plan.skipped)} of the samples lie in them"
+
+
+_LINES: dict[type, Callable[[Any], list[tuple[str, str]]]] = {
+    Plan: _lines,
+    SurfacePlan: _lines_of_surface,
+    MeshPlan: _lines_of_mesh,
+}

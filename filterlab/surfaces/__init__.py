@@ -1,6 +1,7 @@
 """Surfaces: what a ray can hit, exactly.
 
     Field ──▶ LevelSet ──hit(rays)──▶ Hits ──at(rays, hits)──▶ points, normals, curvatures
+                 └──────mesh(…)─────▶ triangles
 
 Every surface finds its hits in its own way; derivatives of a hit, and what is known of the surface there, are written
 once (`surfaces.base`).
@@ -8,5 +9,6 @@ once (`surfaces.base`).
 
 from filterlab.surfaces.base import Hits, Surface, SurfacePoints
 from filterlab.surfaces.level_set import LevelSet
+from filterlab.surfaces.meshes import Mesh, mesh
 
-__all__ = ["Hits", "LevelSet", "Surface", "SurfacePoints"]
+__all__ = ["Hits", "LevelSet", "Mesh", "Surface", "SurfacePoints", "mesh"]

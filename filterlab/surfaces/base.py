@@ -80,6 +80,11 @@ class Surface(ABC):
     domain: Domain
     max_order: int
 
+    @property
+    def device(self) -> torch.device | None:
+        """Where what it was built from is; None: it is computed wherever the rays are."""
+        return None
+
     @abstractmethod
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         """F, and its gradient and Hessian up to an order, at world points (..., 3)."""

@@ -68,6 +68,10 @@ class LevelSet(Surface):
         return LevelSet(self.field.with_tensors(given[: len(own)]), *(given[len(own) :] or [self.level]))
 
     @property
+    def device(self) -> torch.device | None:
+        return self.field.device
+
+    @property
     def detached(self) -> LevelSet:
         """The same surface, of numbers that no derivatives are asked by; the level as it is now."""
         return LevelSet(self._detached_field, self._number)

@@ -174,6 +174,37 @@ def tiny(name, scan):
         "exact": 5,
         "chunk": 25,
     }
+    configs["hit_error"] = {
+        "studies": [{"signal": "torus", "level": 0, "resolutions": [8, 12], "fit_from": 8}],
+        "methods": ["trilinear", {"name": "trilinear", "gradient": "central"}, "triquadratic"],
+        "rays": 40,
+    }
+    configs["isosurface_quality"] = {
+        "figures": [
+            {
+                "title": "a signal",
+                "signal": "torus",
+                "resolution": 8,
+                "surface": 0,
+                "methods": ["triquadratic"],
+                "look": {"size": [12, 10], "error": 0.5},
+                "zooms": [{"title": "the middle", "window": [0.25, 0.25, 0.75, 0.75]}],
+            },
+            {
+                "title": "a scan",
+                "volume": str(scan),
+                "surface": {"level": 120, "material": "reflection_lines", "subpixels": 2},
+                "methods": ["notch"],
+                "look": {"size": [12, 10]},
+            },
+            {
+                "title": "no scan",
+                "volume": {"file": "not_here.nrrd", "optional": True},
+                "surface": 120,
+                "methods": ["notch"],
+            },
+        ]
+    }
     parts = {n: {"experiment": n, "description": f"tiny {n}", **c} for n, c in configs.items()}
     parts["demo"] = {"experiment": "demo", "description": "tiny", "sections": [parts["rms_error"], parts["dvr_volume"]]}
     if name not in parts:
