@@ -325,7 +325,7 @@ def test_thread_numbers_double_up_to_the_cores():
 
 def test_what_is_not_installed_says_how_to_install_it(monkeypatch):
     monkeypatch.setattr(task, "find_spec", lambda name: None)
-    for peer in (*peers.samplers("bspline3", False), *peers.marchers()):
+    for peer in (*peers.samplers("bspline3", False), *peers.marchers(), *peers.casters()):
         assert "pip install" in (peer.missing.__wrapped__() if hasattr(peer.missing, "__wrapped__") else peer.missing())
 
 
@@ -333,6 +333,7 @@ def test_peers_are_asked_only_for_what_they_have():
     assert {p.NAME for p in peers.samplers("linear", True)} == {"torch grid_sample", "torch-interpol"}
     assert {p.NAME for p in peers.samplers("bspline2", True)} == {"torch-interpol", "Dr.Jit by hand"}
     assert {p.NAME for p in peers.marchers()} == {"Dr.Jit loop", "VTK fixed-point"}
+    assert {p.NAME for p in peers.casters()} == {"Mitsuba sdfgrid", "Embree"}
 
 
 # --- every item, tiny ---

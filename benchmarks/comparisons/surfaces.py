@@ -11,7 +11,7 @@ import torch
 
 from benchmarks.comparisons.scaling import thread_numbers
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item, usable_cores
-from benchmarks.peers import embree_mesh, mitsuba_sdfgrid
+from benchmarks.peers import casters, embree_mesh, mitsuba_sdfgrid
 from benchmarks.peers.task import Casting
 from benchmarks.records import at_least, at_most
 from benchmarks.scene import marschner_lobb
@@ -57,7 +57,7 @@ def _hits(task: Casting, method: str, scheme: str = "fused", name: str | None = 
 def _first(settings: Settings) -> Race:
     task = _task(settings)
     contestants, absent, ratios = [_hits(task, method) for method in METHODS], {}, []
-    for peer in (mitsuba_sdfgrid, embree_mesh):
+    for peer in casters():
         if why := peer.missing():
             absent[peer.NAME] = why
             continue

@@ -36,3 +36,8 @@ def samplers(kernel: str, gradient: bool) -> Iterator[ModuleType]:
 def marchers() -> Iterator[ModuleType]:
     """The peers that render, installed or not."""
     return (peer for peer in PEERS if hasattr(peer, "marching"))
+
+
+def casters() -> Iterator[ModuleType]:
+    """The peers that cast rays at level sets, installed or not."""
+    return (peer for peer in PEERS if hasattr(peer, "casting"))

@@ -12,6 +12,7 @@ others of the pack.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -75,41 +76,55 @@ class Walk:
             origins, directions: packs of x, y, z in the world, doubles.
         """
         e, b = self.lanes, self.builder
-        rows = [[self._of_all(self._number("matrix", 3 * i + k)) for k in range(3)] for i in range(3)]
-        own = [e.subtract(x, self._of_all(self._number("origin", i))) for i, x in enumerate(origins)]
-        offset = [self._of_all(self._number("offset", i)) for i in range(3)]
-        origins = [e.subtract(self._dot(row, own), x) for row, x in zip(rows, offset, strict=True)]
-        directions = self._normalized([self._dot(row, directions) for row in rows])
-        first, last, moving = e.constant(0), e.constant(float("inf")), []
-        largest = e.maximum(e.maximum(*(e.absolute(d) for d in directions[:2])), e.absolute(directions[2]))
-        still = [b.fcmp_ordered("<=", e.absolute(d), e.multiply(largest, e.constant(_NO_MOTION))) for d in directions]
-        for i, (o, d) in enumerate(zip(origins, directions, strict=True)):
-            low, high = self._of_all(self._number("lower", i)), self._of_all(self._number("upper", i))
-            speed = e.where(still[i], e.constant(1), d)
-            a, z = e.divide(e.subtract(low, o), speed), e.divide(e.subtract(high, o), speed)
-            within = b.and_(b.fcmp_ordered(">=", o, low), b.fcmp_ordered("<=", o, high))
-            always, never = e.constant(float("-inf")), e.constant(float("inf"))
-            first = e.maximum(e.where(still[i], e.where(within, always, never), e.minimum(a, z)), first)
-            last = e.minimum(e.where(still[i], e.where(within, never, always), e.maximum(a, z)), last)
-            moving.append(e.where(still[i], e.constant(0), d))
-            self._inverse[i].value = e.divide(e.constant(1), speed)
-            self._backward[i].value = self._wide(b.fcmp_ordered("<", speed, e.constant(0)))
-        met = b.and_(real, b.fcmp_ordered("<=", first, last))
-        self.going.value = met
+        origins, directions = self._in_cells(origins, directions)
+        most = e.multiply(self._largest(directions), e.constant(_NO_MOTION))
+        still = [b.fcmp_ordered("<=", e.absolute(d), most) for d in directions]
+        speed = [e.where(rests, e.constant(1), d) for rests, d in zip(still, directions, strict=True)]
+        first, last = self._span(origins, speed, still)
+        self.going.value = met = b.and_(real, b.fcmp_ordered("<=", first, last))
         self.start.value = first = e.where(met, first, e.constant(0))
         self._s.value, self._end.value = e.constant(0), e.where(met, e.subtract(last, first), e.constant(0))
-        for i, (o, d) in enumerate(zip(origins, moving, strict=True)):
-            low, high = self._of_all(self._number("lower", i)), self._of_all(self._number("upper", i))
-            entry = e.clamp(e.multiply_add(first, d, o), low, high)
-            self.entry[i].value, self.direction[i].value = entry, d
-            self._from[i].value = e.where(still[i], e.constant(float("-inf")), entry)
+        for i, (o, d, rests) in enumerate(zip(origins, speed, still, strict=True)):
+            self.direction[i].value = moving = e.where(rests, e.constant(0), d)
+            self.entry[i].value = entry = e.clamp(e.multiply_add(first, moving, o), *self._ends(i))
+            self._from[i].value = e.where(rests, e.constant(-math.inf), entry)
+            self._inverse[i].value = e.divide(e.constant(1), d)
+            self._backward[i].value = self._wide(b.fcmp_ordered("<", d, e.constant(0)))
             self._cell[i].value = self._bounded(e.to_integer(e.floor(entry)), i)
+
+    def _in_cells(self, origins: Sequence[Value], directions: Sequence[Value]) -> tuple[list[Value], list[Value]]:
+        """World to coordinates of cells, with directions as long as is told by `scale`."""
+        e = self.lanes
+        rows = [[self._number("matrix", 3 * i + k) for k in range(3)] for i in range(3)]
+        own = [e.subtract(x, self._number("origin", i)) for i, x in enumerate(origins)]
+        origins = [e.subtract(self._dot(row, own), self._number("offset", i)) for i, row in enumerate(rows)]
+        return origins, self._normalized([self._dot(row, directions) for row in rows])
+
+    def _span(self, origins: Sequence[Value], speed: Sequence[Value], still: Sequence[Value]) -> tuple[Value, Value]:
+        """From where to where rays are in the domain, from 0 on; where they are not, the first is greater."""
+        e, b = self.lanes, self.builder
+        always, never = e.constant(-math.inf), e.constant(math.inf)
+        first, last = e.constant(0), never
+        for i, (o, d, rests) in enumerate(zip(origins, speed, still, strict=True)):
+            low, high = self._ends(i)
+            a, z = e.divide(e.subtract(low, o), d), e.divide(e.subtract(high, o), d)
+            within = b.and_(b.fcmp_ordered(">=", o, low), b.fcmp_ordered("<=", o, high))
+            first = e.maximum(e.where(rests, e.where(within, always, never), e.minimum(a, z)), first)
+            last = e.minimum(e.where(rests, e.where(within, never, always), e.maximum(a, z)), last)
+        return first, last
+
+    def _ends(self, axis: int) -> tuple[Value, Value]:
+        """Of the domain along an axis."""
+        return self._number("lower", axis), self._number("upper", axis)
+
+    def _largest(self, direction: Sequence[Value]) -> Value:
+        x, y, z = (self.lanes.absolute(d) for d in direction)
+        return self.lanes.maximum(self.lanes.maximum(x, y), z)
 
     def _normalized(self, direction: list[Value]) -> list[Value]:
         """Times a power of two, whose inverse leads back from s to t."""
         e, b = self.lanes, self.builder
-        largest = e.maximum(e.maximum(*(e.absolute(d) for d in direction[:2])), e.absolute(direction[2]))
-        exponent = b.and_(e.bits_of(largest), e.integers(_EXPONENT))
+        exponent = b.and_(e.bits_of(self._largest(direction)), e.integers(_EXPONENT))
         self.scale.value = scale = e.of_bits(b.sub(e.integers(_FLIP), exponent))
         return [e.multiply(d, scale) for d in direction]
 
@@ -118,10 +133,9 @@ class Walk:
         return e.multiply_add(row[2], x[2], e.multiply_add(row[1], x[1], e.multiply(row[0], x[0])))
 
     def _number(self, array: str, index: int) -> Value:
-        return self.builder.load(self.lanes.advance(getattr(self.job, array), I64(index), DOUBLE), typ=DOUBLE)
-
-    def _of_all(self, number: Value) -> Value:
-        return self.lanes.everywhere(number)
+        """Of an array of the job, in every lane."""
+        e = self.lanes
+        return e.everywhere(self.builder.load(e.advance(getattr(self.job, array), I64(index), DOUBLE), typ=DOUBLE))
 
     def _bounded(self, cell: Value, axis: int) -> Value:
         zero = ir.Constant(self.integers, [0] * self.lanes.count)

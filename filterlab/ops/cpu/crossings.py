@@ -282,36 +282,37 @@ class _First(_Program):
     def _keep(self, piece: Piece, holds: Value, jump: Value) -> None:
         """Keep a piece for the root search, if it has a root."""
         e, b, search = self.lanes, self.builder, self.search
-        zero = e.constant(0)
-        begin, end = piece.rows[0], piece.rows[-1]
+        zero, begin = e.constant(0), piece.rows[0]
         turn = e.where(b.fcmp_ordered("<", begin, zero), e.constant(-1), e.constant(1))
-        rows = [e.multiply(turn, r) for r in piece.rows]
+        *rows, end = (e.multiply(turn, r) for r in piece.rows)
+        on_end = b.fcmp_ordered("==", end, zero)  # a root for the case that there is no earlier one
+        rows.append(e.where(on_end, e.constant(2.0**-126 if e.bits == 32 else 2.0**-1022), end))
         at_start = b.and_(holds, b.or_(jump, b.fcmp_ordered("==", begin, zero)))
-        on_end = b.fcmp_ordered("==", end, zero)
-        tiny = e.constant(2.0**-126 if e.bits == 32 else 2.0**-1022)
-        rows[-1] = e.where(on_end, tiny, rows[-1])
-        changes = search.changes(search.negative(search.lowered(rows)))
         inner = b.and_(holds, b.not_(at_start))
-        single = b.icmp_unsigned("==", changes, ir.Constant(changes.type, [1] * e.count))
-        below = b.fcmp_ordered("<", rows[-1], zero)
-        simple = b.and_(inner, b.and_(single, below))
+        simple = b.and_(inner, b.and_(self._changes_once(rows), b.fcmp_ordered("<", rows[-1], zero)))
         self._part.assign(e, simple, rows, zero, e.constant(1))
-        found = e.variable(b.or_(at_start, simple))
-        hard = b.and_(inner, b.not_(simple))
+        found, hard = e.variable(b.or_(at_start, simple)), b.and_(inner, b.not_(simple))
+
+        def keep(mask: Value, rows: Rows, a: Value, h: Value) -> None:
+            self._part.assign(e, mask, rows, a, h)
+            found.value = b.or_(found.value, mask)
+
         with b.if_then(e.any(hard), likely=False):
-
-            def keep(mask: Value, rows: Rows, a: Value, h: Value) -> None:
-                self._part.assign(e, mask, rows, a, h)
-                found.value = b.or_(found.value, mask)
-
             search.first_part(hard, rows, keep)
         at_end = b.and_(b.and_(hard, on_end), b.not_(found.value))
-        hit = b.or_(found.value, at_end)
-        self._at_start.value = b.or_(self._at_start.value, at_start)
-        self._at_end.value = b.or_(self._at_end.value, at_end)
-        self._hit.value = b.or_(self._hit.value, hit)
-        self._near.value = self.places.where(hit, piece.found.near, self._near.value)
-        self._far.value = self.places.where(hit, piece.found.far, self._far.value)
+        self._note(piece, b.or_(found.value, at_end), at_start, at_end)
+
+    def _changes_once(self, rows: Rows) -> Value:
+        changes = self.search.changes(self.search.negative(self.search.lowered(rows)))
+        return self.builder.icmp_unsigned("==", changes, ir.Constant(changes.type, [1] * self.lanes.count))
+
+    def _note(self, piece: Piece, hit: Value, at_start: Value, at_end: Value) -> None:
+        """That rays have hit, and where their pieces are."""
+        b, p = self.builder, self.places
+        for kept, mask in ((self._hit, hit), (self._at_start, at_start), (self._at_end, at_end)):
+            kept.value = b.or_(kept.value, mask)
+        self._near.value = p.where(hit, piece.found.near, self._near.value)
+        self._far.value = p.where(hit, piece.found.far, self._far.value)
 
     def finish(self, first: Value, real: Value) -> None:
         e, b, p = self.lanes, self.builder, self.places

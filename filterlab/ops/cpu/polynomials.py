@@ -90,19 +90,16 @@ class Search:
 
     # --- the part that holds the first root ---
 
-    def first_part(self, mask: Value, rows: Rows, found: Callable[[Value, Rows, Value, Value], None]) -> Value:
+    def first_part(self, mask: Value, rows: Rows, found: Callable[[Value, Rows, Value, Value], None]) -> None:
         """Halve [0, 1] of the polynomials under the mask (c_0 > 0), from left to right.
 
         Args:
-            found: is given a mask of those whose part was found, its coefficients, a and h.
-
-        Returns:
-            a mask of those that have none.
+            found: is given a mask of those whose part was found, its coefficients, a and h; the others have none.
         """
         e, b = self.lanes, self.builder
         one, two, half = e.constant(1), e.constant(2), e.constant(0.5)
         own, lowered = [e.kept(r) for r in rows], [e.kept(r) for r in self.lowered(rows)]
-        left, none = e.variable(mask), e.variable(ir.Constant(mask.type, [0] * e.count))
+        left = e.variable(mask)
         a, h = e.variable(e.constant(0)), e.variable(one)
         with e.repeat_while(lambda: e.any(left.value)):
             end = e.add(a.value, h.value)
@@ -122,9 +119,7 @@ class Search:
             wider = b.and_(on, b.fcmp_ordered("==", e.floor(parts), parts))
             h.value = e.where(halves, e.multiply(h.value, half), e.where(wider, doubled, h.value))
             over = b.and_(on, b.fcmp_ordered(">=", a.value, one))
-            none.value = b.or_(none.value, over)
             left.value = b.and_(left.value, b.not_(b.or_(holds, over)))
-        return none.value
 
     def between(self, rows: Rows, start: Value, end: Value) -> Rows:
         """Coefficients on [start, end], by de Casteljau's algorithm at the end and, from there, at start / end."""

@@ -50,43 +50,12 @@ class _Cast:
     """A lattice and rays as a job."""
 
     def __init__(self, given: Raycast, asked: str, origins: Tensor, directions: Tensor) -> None:
-        lattice, self.dtype, self.rays = given.lattice, given.dtype, len(origins)
-        coefficients = _readable(lattice.coefficients)
-        lowered = Stencil((lattice.row,)).lowered
-        self.degree = lattice.degree
-        variant = RaycastVariant(
-            asked,
-            lowered,
-            lattice.degree,
-            lattice.continuous,
-            ARITHMETIC[given.dtype],
-            STORAGE[coefficients.dtype],
-            _has_room(coefficients),
-            lanes_of(given.dtype),
-        )
-        self.function = compiler.compiled(variant)
-        plane, row, _ = coefficients.stride()
-        self.job = RaycastJob(
-            width=row,
-            height=plane // row,
-            rays=self.rays,
-            scale=lattice.scale,
-            shift=lattice.shift - given.level,
-            edge=given.edge.bit_length() - 1,
-        )
-        for axis, cells, bricks in zip(AXES, lattice.cells, given.clear.shape[::-1], strict=True):
-            setattr(self.job, f"cells_{axis}", cells)
-            setattr(self.job, f"bricks_{axis}", bricks)
-        numbers = {"origin": given.origin, "offset": lattice.offset, "lower": lattice.lower, "upper": lattice.upper}
-        arrays = {name: torch.tensor(x, dtype=torch.float64) for name, x in numbers.items()}
-        self.job.point(
-            coefficients=coefficients,
-            origins=origins.to(given.dtype).contiguous(),
-            directions=directions.to(given.dtype).contiguous(),
-            matrix=torch.tensor(given.matrix, dtype=torch.float64),
-            clear=given.clear.contiguous(),
-            **arrays,
-        )
+        self.dtype, self.rays, self.degree = given.dtype, len(origins), given.lattice.degree
+        coefficients = _readable(given.lattice.coefficients)
+        self.function = compiler.compiled(_variant(given, asked, coefficients))
+        self.job = _job(given, coefficients)
+        self.job.rays = self.rays
+        self.job.point(origins=origins.to(given.dtype).contiguous(), directions=directions.to(given.dtype).contiguous())
 
     def run(self, **results: Tensor) -> None:
         job = self.job
@@ -107,6 +76,39 @@ class _Cast:
         flags, (start, near, far) = flags[written], places[written].unbind(-1)
         ray = rays[:, None].expand(-1, capacity)[written]
         return count, Candidates(ray, start, near, far, pieces[written], (flags & JUMP) > 0, (flags & REPEATED) > 0)
+
+
+def _variant(given: Raycast, asked: str, coefficients: Tensor) -> RaycastVariant:
+    lattice = given.lattice
+    return RaycastVariant(
+        asked,
+        Stencil((lattice.row,)).lowered,
+        lattice.degree,
+        lattice.continuous,
+        ARITHMETIC[given.dtype],
+        STORAGE[coefficients.dtype],
+        _has_room(coefficients),
+        lanes_of(given.dtype),
+    )
+
+
+def _job(given: Raycast, coefficients: Tensor) -> RaycastJob:
+    """With all but the rays."""
+    lattice, (plane, row, _) = given.lattice, coefficients.stride()
+    job = RaycastJob(
+        width=row,
+        height=plane // row,
+        scale=lattice.scale,
+        shift=lattice.shift - given.level,
+        edge=given.edge.bit_length() - 1,
+    )
+    for axis, cells, bricks in zip(AXES, lattice.cells, given.clear.shape[::-1], strict=True):
+        setattr(job, f"cells_{axis}", cells)
+        setattr(job, f"bricks_{axis}", bricks)
+    numbers = {"origin": given.origin, "offset": lattice.offset, "lower": lattice.lower, "upper": lattice.upper}
+    arrays = {name: torch.tensor(x, dtype=torch.float64) for name, x in (numbers | {"matrix": given.matrix}).items()}
+    job.point(coefficients=coefficients, clear=given.clear.contiguous(), **arrays)
+    return job
 
 
 def _readable(coefficients: Tensor) -> Tensor:
