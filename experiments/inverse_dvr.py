@@ -220,7 +220,7 @@ def _volume(config: Config, problem: VolumeProblem, key: str, run: Run) -> Recor
         "images": images,
         "slices": slices,
         "voxels": array,
-        "files": [*_files(images), *_files(slices), array],
+        "files": [*files(images), *files(slices), array],
     }
 
 
@@ -272,10 +272,10 @@ def _images(
     return saved
 
 
-def _files(record: Any) -> list[str]:
+def files(record: Any) -> list[str]:
     """Every file that a record names, however deep."""
     if isinstance(record, dict):
-        return [name for value in record.values() for name in _files(value)]
+        return [name for value in record.values() for name in files(value)]
     return [record] if isinstance(record, str) else []
 
 
@@ -296,7 +296,7 @@ def _transfer(config: Config, problem: TransferProblem, key: str, run: Run) -> R
         "histogram": {"low": problem.low, "high": problem.high, "shares": (counts / counts.sum()).tolist()},
         "unit": problem.unit,
         "images": images,
-        "files": _files(images),
+        "files": files(images),
     }
 
 

@@ -24,6 +24,8 @@ _NAMES = (
     "dvr_volume",
     "texture_precision",
     "inverse_dvr",
+    "inverse_surface",
+    "silhouettes",
     "speed_accuracy",
     "equal_error",
     "brick_economy",

@@ -5,6 +5,7 @@ from filterlab.render.dvr import render
 from filterlab.render.materials import Environment, Material, Phong, ReflectionLines, Toon
 from filterlab.render.raycast import raycast
 from filterlab.render.shading import Light, Shading
+from filterlab.render.silhouettes import Silhouettes
 from filterlab.render.transfer import TransferFunction
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "Phong",
     "ReflectionLines",
     "Shading",
+    "Silhouettes",
     "Toon",
     "TransferFunction",
     "raycast",

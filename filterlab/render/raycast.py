@@ -8,7 +8,7 @@ Rays begin where they enter the domain (and the region): t is measured from near
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -30,6 +30,7 @@ from filterlab.render.image import (
 from filterlab.render.materials import Material, Phong, Seen
 from filterlab.render.rays import Region, Spans, check_region, jitter, spans
 from filterlab.render.shading import Light
+from filterlab.render.silhouettes import COUNTED, Eye, Silhouettes, swept
 from filterlab.surfaces.base import Hits, Surface, SurfacePoints, check_sheets
 
 _PART = 1 << 15  # rays at a time; what they meet is cut up further by the surface
@@ -69,6 +70,12 @@ class Casting:
             "sheets": lambda: hits.valid.sum(-1, keepdim=True).to(self.dtype),
         }
         return torch.cat([parts[name]() for name in channels], -1)
+
+    def eye(self, seen: PixelRays, channels: Sequence[str]) -> Eye:
+        """The same, for finding edges in those channels: hits in float64, without derivatives."""
+        counting = replace(self, sheets=COUNTED, dtype=torch.float64)
+        radiance = lambda o, d: self(o, d, channels)  # noqa: E731
+        return Eye(self.surface, self.region, seen.rays, lambda inside: counting._hits(inside).t, radiance)
 
     def _hits(self, inside: Spans) -> Hits:
         """Those within the spans: t (R, k) from where rays enter."""
@@ -132,6 +139,7 @@ def raycast(
     sheets: int = 1,
     shadows: bool = False,
     subpixels: int = 1,
+    silhouettes: Silhouettes | None = None,
     seed: int = 0,
     channels: Sequence[str] | None = None,
     dtype: torch.dtype = torch.float32,
@@ -151,7 +159,10 @@ def raycast(
         sheets: how many hits of a ray are composited, in exact order; 1 unless the material is transparent.
         shadows: whether a second ray to every light that is no headlight asks what stands in between.
         subpixels: s: every pixel is the mean of s² rays, one at a place drawn in each of s × s parts of it.
-        seed: of those places, which depend on it and the pixel's number alone.
+        silhouettes: how the edges of what is seen are looked for, whose motion is then part of the derivatives; None:
+            it is not. The image is the same. Edges are those of `filterlab.render.silhouettes`: not those of shadows,
+            nor where a material or a normal jumps on the surface.
+        seed: of those places and lines, which depend on it and the pixel's number alone.
         channels: some of `CHANNELS`, each as a tensor of its own: `color`; `depth`, the world distance, ∞ where nothing
             is hit; `normal` and `position`, of the first hit, 0 where none; `sheets`, how many were hit.
         dtype: float32 or float64, of hits and image.
@@ -160,14 +171,15 @@ def raycast(
 
     Returns:
         `(H, W, 4)` (or `(..., 4)` for rays): linear RGB over the background, and opacity. With `channels` a dictionary
-        of `(H, W, n)`. Differentiable in whatever the surface, camera, lights, material and background depend on, but
-        not in where a silhouette is: a pixel's hit moves, it does not come or go.
+        of `(H, W, n)`. Differentiable in whatever the surface, camera, lights, material and background depend on: a
+        pixel's hit moves. It comes and goes only with `silhouettes`, of which there are first derivatives.
 
     Raises:
-        TypeError: no surface, camera or material. ValueError: numbers out of range, channels that are not known, more
-            than one ray a pixel for other channels than the colour.
+        TypeError: no surface, camera, material or silhouettes. ValueError: numbers out of range, channels that are not
+            known, more than one ray a pixel for other channels than the colour, silhouettes of rays without a camera.
     """
     _check(surface, material, sheets, subpixels, channels, dtype, camera)
+    _check_silhouettes(silhouettes, camera)
     check_camera(camera)
     device = torch.device(device or device_of(camera) or "cpu")
     seen = PixelRays.of(camera, size, device)
@@ -182,12 +194,13 @@ def raycast(
         shadows,
         dtype,
     )
+    at_once = max(sheets, silhouettes.lines if silhouettes else 1)
     canvas = Canvas(seen, None, torch.is_grad_enabled(), sum(CHANNELS[name] for name in asked))
     with reporting(progress, seen.count) as report:
 
         def parts() -> Iterator[tuple[int, range, Tensor]]:
-            for order in seen.parts(max(_PART // sheets, 1)):
-                yield 0, order, _mean(cast, seen, order, asked, subpixels, seed)
+            for order in seen.parts(max(_PART // at_once, 1)):
+                yield 0, order, _mean(cast, seen, order, asked, subpixels, silhouettes, seed)
                 report(order.stop)
 
         image = canvas.filled(parts(), torch.zeros(0, dtype=dtype, device=device))
@@ -197,13 +210,24 @@ def raycast(
     return dict(zip(asked, image.split(widths, -1), strict=True))
 
 
-def _mean(cast: Casting, seen: PixelRays, order: range, asked: Sequence[str], subpixels: int, seed: int) -> Tensor:
-    """Of all rays of some pixels."""
+def _mean(
+    cast: Casting,
+    seen: PixelRays,
+    order: range,
+    asked: Sequence[str],
+    subpixels: int,
+    silhouettes: Silhouettes | None,
+    seed: int,
+) -> Tensor:
+    """Of all rays of some pixels, with the derivatives of their edges."""
     pixels = seen.pixels(order)
     total = torch.zeros((), dtype=cast.dtype, device=pixels.device)
     for place in _places(pixels, subpixels, seed):
         total = total + cast(*seen.rays(pixels, place), asked)
-    return total / subpixels**2
+    mean = total / subpixels**2
+    if silhouettes is None or not torch.is_grad_enabled():
+        return mean
+    return mean + swept(silhouettes, cast.eye(seen, asked), pixels, seed)
 
 
 def _places(pixels: Tensor, subpixels: int, seed: int) -> Iterator[Place]:
@@ -241,3 +265,10 @@ def _check(
         raise ValueError(f"channels must be some of {', '.join(CHANNELS)}; got {channels!r}")
     if subpixels > 1 and channels is not None and set(channels) != {"color"}:
         raise ValueError("one ray a pixel for other channels than the colour: depths and normals have no mean")
+
+
+def _check_silhouettes(silhouettes: Silhouettes | None, camera: object) -> None:
+    if not isinstance(silhouettes, Silhouettes | None):
+        raise TypeError(f"silhouettes must be Silhouettes(lines, parts), or None; got {type(silhouettes).__name__}")
+    if silhouettes is not None and not isinstance(camera, Camera):
+        raise ValueError("silhouettes go with a camera: rays alone have no pixels that edges could sweep over")

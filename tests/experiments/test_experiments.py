@@ -165,6 +165,27 @@ def tiny(name, scan):
         "seconds": 0.01,
     }
     configs["stability"] = {"methods": ["trilinear"], "cases": ["nan-coordinate"], "amount": 0.02}
+    configs["inverse_surface"] = {
+        "balls": [{"center": [0.2, 0, 0], "sigma": 0.3}],
+        "target_resolution": 8,
+        "resolution": 6,
+        "method": "trilinear",
+        "views": {"training": 2, "held_out": 1, "size": 6, "shown": 8, "at_once": 1},
+        "descent": {"iterations": 2, "learning_rate": 0.01},
+    }
+    configs["silhouettes"] = {
+        "methods": ["trilinear"],
+        "volumes": ["ball"],
+        "parameters": ["level"],
+        "quantities": ["mask"],
+        "size": 4,
+        "subpixels": 1,
+        "lines": 1,
+        "parts": 1,
+        "estimates": 2,
+        "rows": 2,
+        "repeats": 2,
+    }
     configs["root_finding"] = {
         "families": ["random", "double", "root-at-end"],
         "degrees": [4, 5],

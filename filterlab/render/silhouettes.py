@@ -1,0 +1,271 @@
+"""Silhouettes: the part of an image's derivative that no hit sees, since hits move but what is hit changes at edges.
+
+Letters: a pixel is the mean of L(u, v), u and v from left and top in 0 … 1. L jumps where the first hit becomes another
+one or none: at the edges of what is seen, on curves m(u, v, θ) = 0. When θ changes, an edge sweeps over a part of the
+pixel, and the mean changes by
+
+    ∫ [L] ν dℓ,    ν = −∂m/∂θ / |∇m|, with [L] the jump along ∇m from the side that the edge leaves
+
+beside what the hits' own derivatives give. Points of edges are found on lines through the pixel, across or down, and
+counted with the inverse of how often such lines meet them there: ½ (|m_u| + |m_v|) / |∇m| for each unit of length, so
+that a line that touches an edge counts no more than another.
+
+What m is says the ray on the edge. With F = 0 the surface (`surfaces.base`), o + t d the ray:
+
+| edge | m |
+|---|---|
+| two hits become one and vanish | (s₂ F(o + t₁ d) − s₁ F(o + t₂ d)) / (s₂ − s₁), t₁ and t₂ held, s their slopes ∇F·d |
+| a hit leaves through a face of domain or region, or where rays begin | F of the point where the ray meets the face |
+
+Of the first, the derivative along the ray is 0 by its weights, be it smooth there or a crease of the surface: so m is
+the extremum of F, whose place does not matter (the envelope theorem), and no second derivative of F is asked. Nothing
+needs a distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from filterlab.ops.reference.optics import dot
+from filterlab.render.image import Place
+from filterlab.render.rays import Region, Spans, jitter, spans
+from filterlab.surfaces.base import Surface
+
+COUNTED = 64
+"""Hits of a ray that are told apart: edges behind the last are not seen."""
+
+_CUT, _ROUNDS = 8, 10  # parts that what an edge lies in is cut into, and how often: L is that of 8⁻¹⁰ of it away
+_AT_FACE = 1e-4  # of the domain's diagonal: a hit that vanishes farther from a face is none that left through it
+_STREAM = 1 << 48  # numbers from here on are drawn for lines, those below for subpixels
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """How edges are looked for in an image.
+
+    Attributes:
+        lines: through every pixel, each across or down at a place that is drawn; more of them make derivatives less
+            noisy, and change nothing of what is expected.
+        parts: of each line, between whose ends hits are counted: what comes and goes again within one is not seen.
+
+    Raises:
+        ValueError: not two integers from 1 to 64.
+    """
+
+    lines: int = 1
+    parts: int = 2
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 64:
+                raise ValueError(f"{name} of silhouettes must be an integer from 1 to 64; got {value!r}")
+
+
+@dataclass(frozen=True)
+class Eye:
+    """What is looked at.
+
+    Attributes:
+        surface, region: as of `raycast`.
+        rays: those of some pixels, through a place within each.
+        hits: t (R, `COUNTED`) of spans of rays, in order, from where they enter.
+        radiance: (R, width) of rays: what jumps.
+    """
+
+    surface: Surface
+    region: Region | None
+    rays: Callable[[Tensor, Place], tuple[Tensor, Tensor]]
+    hits: Callable[[Spans], Tensor]
+    radiance: Callable[[Tensor, Tensor], Tensor]
+
+    def spans(self, lines: _Lines, x: Tensor) -> Spans:
+        """Those of the rays at x of lines."""
+        return spans(*self.rays(lines.pixel, lines.place(x)), self.surface.domain, self.region)
+
+    def sheets(self, lines: _Lines, x: Tensor) -> Tensor:
+        """Their hits (Q, `COUNTED`)."""
+        return self.hits(self.spans(lines, x))
+
+    def count(self, lines: _Lines, x: Tensor) -> Tensor:
+        """How many, (Q,)."""
+        return (self.sheets(lines, x) < torch.inf).sum(-1)
+
+
+class _Lines(NamedTuple):
+    """Lines through pixels.
+
+    Attributes:
+        pixel: its number (Q,). row: its place among those in work (Q,).
+        across: (Q,) whether u runs along it, not v. beside: (Q,) the other of both.
+    """
+
+    pixel: Tensor
+    row: Tensor
+    across: Tensor
+    beside: Tensor
+
+    @classmethod
+    def drawn(cls, pixels: Tensor, lines: int, seed: int) -> _Lines:
+        """So many through every pixel: a coin says which way the first goes, and the others take turns."""
+        draw = lambda stream: jitter(seed, _STREAM + pixels * (lines + 1) + stream)  # noqa: E731
+        coin, beside = draw(lines) < 0.5, torch.stack([draw(k) for k in range(lines)])
+        across = torch.stack([coin ^ bool(k % 2) for k in range(lines)])
+        row = torch.arange(len(pixels), device=pixels.device)
+        return cls(pixels.repeat(lines), row.repeat(lines), across.flatten(), beside.flatten())
+
+    def some(self, which: Tensor) -> _Lines:
+        return _Lines(*(field[which] for field in self))
+
+    def place(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(u, v) of x along the lines."""
+        return torch.where(self.across, x, self.beside), torch.where(self.across, self.beside, x)
+
+
+class _Edges(NamedTuple):
+    """Where numbers of hits change along lines.
+
+    Attributes:
+        low, high: (Q,) x just before and just behind.
+        rich: (Q,) that of them with more hits.
+        t: (Q, 2) of the two hits that vanish there, or twice the one, from where the ray enters.
+        fold: (Q,) whether they are two.
+        entering: (Q,) whether one leaves where rays enter, not where they end.
+    """
+
+    lines: _Lines
+    low: Tensor
+    high: Tensor
+    rich: Tensor
+    t: Tensor
+    fold: Tensor
+    entering: Tensor
+
+    def some(self, which: Tensor) -> _Edges:
+        return _Edges(self.lines.some(which), *(field[which] for field in self[1:]))
+
+
+def swept(how: Silhouettes, eye: Eye, pixels: Tensor, seed: int) -> Tensor:
+    """(R, width) of 0, with the derivative of the pixels by what edges sweep over; first derivatives only."""
+    with torch.no_grad():
+        edges = _found(eye, _Lines.drawn(pixels, how.lines, seed), how.parts)
+        jump = _jump(eye, edges) / how.lines
+    moved = (_moved(eye, edges)[:, None] * jump).to(jump)
+    return jump.new_zeros(len(pixels), jump.shape[-1]).index_add(0, edges.lines.row, moved)
+
+
+# --- finding edges ----------------------------------------------------------------------------------------------------
+
+
+def _found(eye: Eye, lines: _Lines, parts: int) -> _Edges:
+    low, high, which = (torch.cat(column) for column in zip(*_brackets(eye, lines, parts), strict=True))
+    lines = lines.some(which)
+    low, high = _narrowed(eye, lines, low, high)
+    return _classified(eye, lines, low, high)
+
+
+def _brackets(eye: Eye, lines: _Lines, parts: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """The ends (Q,) of parts of lines with other numbers of hits, and which lines."""
+    ends = [torch.full_like(lines.beside, k / parts) for k in range(parts + 1)]
+    before = eye.count(lines, ends[0])
+    for low, high in pairwise(ends):
+        behind = eye.count(lines, high)
+        which = (before != behind).nonzero()[:, 0]
+        yield low[which], high[which], which
+        before = behind
+
+
+def _narrowed(eye: Eye, lines: _Lines, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Both, as near each other as cutting what lies between into ever smaller parts brings them."""
+    count, each = eye.count(lines, low), torch.arange(len(low), device=low.device)
+    inner = torch.arange(1, _CUT, dtype=low.dtype, device=low.device) / _CUT
+    several = lines.some(each.repeat_interleave(_CUT - 1))
+    for _ in range(_ROUNDS if len(low) else 0):
+        between = torch.lerp(low[:, None], high[:, None], inner)
+        same = eye.count(several, between.flatten()).view_as(between) == count[:, None]
+        before = same.long().cumprod(1).sum(1)  # how many, from low on, have as many hits as low
+        ends = torch.cat((low[:, None], between, high[:, None]), 1)
+        low, high = ends[each, before], ends[each, before + 1]
+    return low, high
+
+
+def _classified(eye: Eye, lines: _Lines, low: Tensor, high: Tensor) -> _Edges:
+    """What vanishes there; without what neither folds nor leaves through a face, as at holes."""
+    before, behind = eye.sheets(lines, low), eye.sheets(lines, high)
+    falls = ((before < torch.inf).sum(-1) > (behind < torch.inf).sum(-1))[:, None]
+    more, fewer = torch.where(falls, before, behind), torch.where(falls, behind, before)
+    rich = torch.where(falls[:, 0], low, high)
+    first, fold = _vanishing(more, fewer)
+    t = more.gather(1, torch.stack((first, first + fold.long()), 1).clamp(max=COUNTED - 1))
+    length = eye.spans(lines, rich).length
+    entering = t[:, 0] < length / 2
+    beyond = torch.where(entering, t[:, 0], (t[:, 0] - length).abs())
+    kept = fold | (beyond < _AT_FACE * eye.surface.domain.diagonal)
+    return _Edges(lines, low, high, rich, t, fold, entering).some(kept)
+
+
+def _vanishing(more: Tensor, fewer: Tensor) -> tuple[Tensor, Tensor]:
+    """Which of the hits t (Q, S) are missing among fewer, by the first of them, and whether they are two: (Q,) each.
+
+    Those whose removal makes both rows most alike: Σ_{j<i} |t_j − t'_j| + Σ_{j≥i} |t_{j+a} − t'_j| is least, of a hits
+    removed from i on.
+    """
+    count, left = ((t < torch.inf).sum(-1) for t in (more, fewer))
+    fold = (count - left) % 2 == 0
+    place = torch.arange(more.shape[1], device=more.device)
+    later = more.gather(1, (place + 1 + fold.long()[:, None]).clamp(max=more.shape[1] - 1))
+    there = (fewer < torch.inf) & (later < torch.inf)
+    apart = [torch.where(there, t - fewer, 0).abs().cumsum(1) for t in (more, later)]
+    before, behind = apart[0].roll(1, 1), apart[1][:, -1:] - apart[1].roll(1, 1)
+    before[:, 0], behind[:, 0] = 0, apart[1][:, -1]
+    cost = torch.where(place <= left[:, None], before + behind, torch.inf)
+    return cost.argmin(1), fold
+
+
+# --- how they move ----------------------------------------------------------------------------------------------------
+
+
+def _jump(eye: Eye, edges: _Edges) -> Tensor:
+    """L (Q, width) before the edge less L behind it; 0 where one of both is not finite, as depths of nothing are."""
+    before, behind = (eye.radiance(*eye.rays(edges.lines.pixel, edges.lines.place(x))) for x in (edges.low, edges.high))
+    return torch.where(before.isfinite() & behind.isfinite(), before - behind, 0)
+
+
+def _moved(eye: Eye, edges: _Edges) -> Tensor:
+    """(Q,) 0, with the derivatives of where edges are along their lines, weighted as both kinds of lines are."""
+    weights, across, down = _slopes(eye, edges)
+    own = torch.where(edges.lines.across, across, down).sign()
+    size = across.abs() + down.abs()
+    factor = torch.where(size > 0, -2 * own / torch.where(size > 0, size, 1), 0)
+    m = (weights * _values(eye, eye.surface, edges, edges.lines.place(edges.rich), edges.t)).sum(-1)
+    return factor * (m - m.detach())
+
+
+@torch.enable_grad()
+def _slopes(eye: Eye, edges: _Edges) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights (Q, 2) of m, and m_u, m_v (Q,); without derivatives."""
+    u, v = (x.detach().requires_grad_() for x in edges.lines.place(edges.rich))
+    t = edges.t.detach().requires_grad_()
+    values = _values(eye, eye.surface.detached, edges, (u, v), t)
+    (slope,) = torch.autograd.grad(values.sum(), t, retain_graph=True)
+    near, far = slope.unbind(-1)
+    share = torch.where(edges.fold, (far / (far - near)).nan_to_num(0.5).clamp(0, 1), 1)
+    weights = torch.stack((share, 1 - share), -1)
+    across, down = torch.autograd.grad((weights * values).sum(), (u, v))
+    return weights, across, down
+
+
+def _values(eye: Eye, surface: Surface, edges: _Edges, place: Place, t: Tensor) -> Tensor:
+    """F (Q, 2) of both points of folds, or twice that of the point on a face."""
+    origins, directions = eye.rays(edges.lines.pixel, place)
+    inside = spans(origins, directions, surface.domain, eye.region)
+    before = dot((inside.entry - origins).detach(), directions.detach())[:, None]
+    folds = origins[:, None] + (before + t)[..., None] * directions[:, None]
+    leaving = inside.entry + inside.length[:, None] * directions
+    face = torch.where(edges.entering[:, None], inside.entry, leaving)[:, None]
+    return surface.jet(torch.where(edges.fold[:, None, None], folds, face), 0)[0]

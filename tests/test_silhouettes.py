@@ -1,0 +1,208 @@
+"""Edges of images: where they are found, how they move, and that images' derivatives then are those of their means."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import filterlab as fl
+from experiments.config import Recipe
+from experiments.silhouettes import Scene, between, mean_and_error
+from filterlab.methods import METHODS
+from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Phong, Silhouettes, raycast, silhouettes
+from filterlab.render.image import PixelRays, check_background
+from filterlab.render.raycast import Casting
+from filterlab.surfaces import LevelSet
+
+F64 = torch.float64
+N, RADIUS, SIZE = 12, 3.0, (14, 12)
+CENTER = (N - 1) / 2
+
+
+def squares() -> Tensor:
+    """|x|² from the middle of N³ voxels."""
+    x = torch.arange(N, dtype=F64) - CENTER
+    return x[:, None, None] ** 2 + x[:, None] ** 2 + x**2
+
+
+def ball(level: Tensor | float = RADIUS**2) -> LevelSet:
+    """|x|² ≤ level, which the quadratic spline reproduces, but for what the boundary does voxels away."""
+    return LevelSet(fl.reconstruct(fl.Volume(squares()), "triquadratic"), level)
+
+
+def camera(**changes) -> OrthographicCamera:
+    """Along +y: pixels are at x and z."""
+    given = {"position": (CENTER, -30.0, CENTER), "target": (CENTER,) * 3, "height": 9.0, **changes}
+    return OrthographicCamera(up=(0, 0, 1), **given)
+
+
+def cast(surface: LevelSet, lines: int = 1, seen=None, **options) -> Tensor:
+    how = Silhouettes(lines) if lines else None
+    return raycast(surface, seen or camera(), size=SIZE, dtype=F64, silhouettes=how, **options)
+
+
+def bumps(method: str, amount: Tensor, level: Tensor) -> LevelSet:
+    """A ball of noise, changed by a known pattern."""
+    noise = torch.rand(10, 10, 10, generator=torch.Generator().manual_seed(1), dtype=F64)
+    x = torch.arange(10, dtype=F64) - 4.5
+    samples = 1.2 * noise - (x[:, None, None] ** 2 + x[:, None] ** 2 + x**2) / 10
+    pattern = torch.cos(torch.arange(1000, dtype=F64)).reshape(10, 10, 10)
+    return LevelSet(fl.reconstruct(fl.Volume(samples + amount * pattern), method), level)
+
+
+REGION = ((0.0, 3.3, 0.0), (7.0, 30.0, 30.0))
+
+
+def eye(method: str, amount: Tensor, level: Tensor, position: Tensor) -> silhouettes.Eye:
+    view = PerspectiveCamera(position=position, target=(4.5, 4.5, 4.5), field_of_view=28.0)
+    seen = PixelRays.of(view, (7, 7), torch.device("cpu"))
+    background = check_background((0, 0, 0), torch.device("cpu"))
+    casting = Casting(bumps(method, amount, level), Phong(), (Light(),), background, REGION, 1, False, F64)
+    return casting.eye(seen, ("color",))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_edges_move_as_their_derivative_says(method):
+    """On folds, smooth and on creases between cells, and on faces: by the places where they are found again."""
+    given = [torch.tensor(x, dtype=F64, requires_grad=True) for x in (0.0, -1.0, [4.0, -18.0, 6.0])]
+    own = eye(method, *given)
+    with torch.no_grad():
+        lines = silhouettes._Lines.drawn(torch.arange(49), 1, 0)
+        edges = silhouettes._found(own, lines, 2)
+    assert 3 < int(edges.fold.sum()) < len(edges.low) - 2
+    weights, across, down = silhouettes._slopes(own, edges)
+    values = silhouettes._values(own, own.surface, edges, edges.lines.place(edges.rich), edges.t)
+    slope = torch.where(edges.lines.across, across, down)
+    m = (weights * values).sum(-1)
+    step, along = 1e-5, (1.0, 1.0, torch.tensor([0.3, 0.5, -0.4], dtype=F64))
+    for k, direction in enumerate(along):
+        rows = [torch.autograd.grad(x, given[k], retain_graph=True)[0] for x in m]
+        expected = -torch.stack([(row * direction).sum() for row in rows]) / slope
+        ends = []
+        for sign in (1, -1):
+            moved = [x.detach() for x in given]
+            moved[k] = moved[k] + sign * step * direction
+            other, reach = eye(method, *moved), 2 * step * expected.abs() + 1e-9
+            low, high = silhouettes._narrowed(other, edges.lines, edges.low - reach, edges.high + reach)
+            ends.append(torch.where(edges.rich == edges.low, low, high))
+        found = (ends[0] - ends[1]) / (2 * step)
+        error = (found - expected).abs() / (expected.abs() + 1e-2)
+        assert float(error.median()) < 1e-6
+        assert float(error.max()) < 0.05
+
+
+def test_area_and_place_of_a_ball():
+    """Coverage is π level / the image's area; a camera that moves aside changes it nowhere, but where it covers."""
+    level = torch.tensor(RADIUS**2, dtype=F64, requires_grad=True)
+    aside = torch.zeros((), dtype=F64, requires_grad=True)
+    shift = aside * torch.tensor([1.0, 0.0, 0.0], dtype=F64)
+    place, target = (torch.tensor(p, dtype=F64) + shift for p in ((CENTER, -30.0, CENTER), (CENTER,) * 3))
+    mask = cast(ball(level), 16, camera(position=place, target=target))[..., 3]
+    area = 9.0 * 9.0 * SIZE[0] / SIZE[1]
+    grown, moved = torch.autograd.grad(mask.mean() * area, (level, aside), retain_graph=True)
+    assert float(grown) == pytest.approx(math.pi, rel=0.03)
+    assert abs(float(moved)) < 1.5  # what is gained on the right, 6, is lost on the left
+    right = mask[:, SIZE[0] // 2 :].mean() * area / 2
+    (gone,) = torch.autograd.grad(right, aside)
+    assert abs(float(gone)) == pytest.approx(2 * RADIUS, rel=0.1)  # the diameter leaves to the left
+
+
+@pytest.mark.parametrize(
+    ("volume", "parameter", "quantity"),
+    [("ball", "level", "mask"), ("bumps", "sample", "depth"), ("bumps", "camera", "shaded"), ("cut", "level", "depth")],
+)
+def test_derivatives_are_those_of_means(volume, parameter, quantity):
+    """Against differences of integrals along rows, of which nothing is shared with how edges are found."""
+    scene = Scene(Recipe.model_validate("triquadratic"), volume, parameter, quantity)
+    mean, error = mean_and_error([scene.estimated(16, 2, Silhouettes(4), seed) for seed in range(4)])
+    truth, doubt = mean_and_error(scene.differences(16, 4, 0))
+    bound = 4.5 * math.hypot(error, doubt)
+    assert abs(mean - truth) < bound
+    assert abs(scene.estimated(16, 2, None, 0) - truth) > 0.3 * abs(truth)  # without edges it is another number
+
+
+def test_the_rule_between_jumps_bears_square_roots():
+    u, weight = between(torch.tensor([0.2], dtype=F64), torch.tensor([0.7], dtype=F64))
+    for f, expected in ((torch.ones_like(u), 0.5), ((u - 0.2).sqrt(), 0.5**1.5 * 2 / 3), (u**3, (0.7**4 - 0.2**4) / 4)):
+        assert float((weight * f).sum()) == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_image_is_the_same_and_nothing_is_recorded_in_vain():
+    level = torch.tensor(RADIUS**2, dtype=F64, requires_grad=True)
+    channels = ("color", "depth", "normal", "position", "sheets")
+    plain, edged = (cast(ball(level), lines, channels=channels) for lines in (0, 1))
+    assert all(torch.equal(plain[name], edged[name]) for name in channels)
+    assert not cast(ball(), 1).requires_grad
+    with torch.no_grad():
+        assert not cast(ball(level), 1).requires_grad
+
+
+def test_channels_jump_by_what_is_seen():
+    """A normal by itself, as nothing has 0; a depth not, as nothing has none."""
+    level = torch.tensor(RADIUS**2, dtype=F64, requires_grad=True)
+    seen = cast(ball(level), 8, channels=("depth", "normal", "sheets"), sheets=2)
+    count, interior = (cast(ball(level), lines, channels=("sheets",), sheets=2)["sheets"] for lines in (8, 0))
+    assert not interior.requires_grad
+    (grown,) = torch.autograd.grad(count.mean() * 81 * SIZE[0] / SIZE[1], level)
+    assert float(grown) == pytest.approx(2 * math.pi, rel=0.05)
+    depth = seen["depth"][seen["depth"].isfinite()].sum()
+    alone = cast(ball(level), 0, channels=("depth",))["depth"]
+    (a,), (b,) = (torch.autograd.grad(x, level, retain_graph=True) for x in (depth, alone[alone.isfinite()].sum()))
+    assert float(a) == pytest.approx(float(b), rel=1e-9)
+    outward = (seen["normal"] * torch.linspace(-1, 1, SIZE[0], dtype=F64)[:, None])[..., 0].sum()
+    still = cast(ball(level), 0, channels=("normal",))["normal"]
+    inward = (still * torch.linspace(-1, 1, SIZE[0], dtype=F64)[:, None])[..., 0].sum()
+    (turned,), (alone,) = (torch.autograd.grad(x, level, retain_graph=True) for x in (outward, inward))
+    assert float(turned) > 0 > float(alone)  # hits turn towards the eye when the ball grows, but there are more of them
+
+
+def test_edges_hidden_behind_what_is_opaque_do_not_count():
+    """A ball in front of another one that ends behind it: its mask moves with the first alone."""
+    x = torch.arange(N, dtype=F64) - CENTER
+    near = x[:, None, None] ** 2 + (x[:, None] + 2.5) ** 2 + x**2 - 2.5**2
+    far = 1.5 * (x[:, None, None] ** 2 + (x[:, None] - 2.5) ** 2 + x**2) - 1.5 * 1.5**2
+    amount = torch.zeros((), dtype=F64, requires_grad=True)
+    field = fl.reconstruct(
+        fl.Volume(torch.minimum(near, far + amount * (x[:, None] > 0))), "triquadratic", prefilter=False
+    )
+    mask = cast(LevelSet(field, 0.0), 4)[..., 3]
+    (slope,) = torch.autograd.grad(mask.sum(), amount)
+    assert float(slope) == 0
+
+
+def test_seeds_and_parts_of_the_work(monkeypatch):
+    """A derivative depends on the seed, and on nothing that divides the work."""
+
+    def slope(seed: int) -> float:
+        level = torch.tensor(RADIUS**2, dtype=F64, requires_grad=True)
+        return float(torch.autograd.grad(cast(ball(level), 2, seed=seed)[..., 3].sum(), level)[0])
+
+    whole = slope(3)
+    assert slope(4) != whole
+    monkeypatch.setattr(
+        PixelRays, "parts", lambda s, _: [range(i, min(i + 37, s.count)) for i in range(0, s.count, 37)]
+    )
+    assert slope(3) == pytest.approx(whole, rel=1e-12)
+
+
+def test_nothing_to_see_has_no_edges():
+    level = torch.tensor(-1.0, dtype=F64, requires_grad=True)
+    image = cast(ball(level), 1)
+    assert not image.any()
+    assert float(torch.autograd.grad(image.sum(), level)[0]) == 0
+
+
+@pytest.mark.parametrize("given", [{"lines": 0}, {"parts": 65}, {"lines": 1.0}, {"parts": True}])
+def test_numbers_that_cannot_be_are_refused(given):
+    with pytest.raises(ValueError, match="of silhouettes must be an integer from 1 to 64"):
+        Silhouettes(**given)
+
+
+def test_what_has_no_edges_is_refused():
+    with pytest.raises(TypeError, match="must be Silhouettes"):
+        raycast(ball(), camera(), size=SIZE, silhouettes=2)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="go with a camera"):
+        raycast(ball(), camera().rays(*SIZE), silhouettes=Silhouettes())
