@@ -86,7 +86,8 @@ class Eye:
 
     def spans(self, lines: _Lines, x: Tensor) -> Spans:
         """Those of the rays at x of lines."""
-        return spans(*self.rays(lines.pixel, lines.place(x)), self.surface.domain, self.region)
+        origins, directions = self.rays(lines.pixel, lines.place(x))
+        return spans(origins.detach(), directions.detach(), self.surface.domain, self.region)
 
     def sheets(self, lines: _Lines, x: Tensor) -> Tensor:
         """Their hits (Q, `COUNTED`)."""
@@ -152,9 +153,9 @@ class _Edges(NamedTuple):
 
 def swept(how: Silhouettes, eye: Eye, pixels: Tensor, seed: int) -> Tensor:
     """(R, width) of 0, with the derivative of the pixels by what edges sweep over; first derivatives only."""
-    with torch.no_grad():
-        edges = _found(eye, _Lines.drawn(pixels, how.lines, seed), how.parts)
-        jump = _jump(eye, edges) / how.lines
+    edges = _found(eye, _Lines.drawn(pixels, how.lines, seed), how.parts)
+    edges = edges._replace(t=edges.t.detach())
+    jump = _jump(eye, edges).detach() / how.lines
     moved = (_moved(eye, edges)[:, None] * jump).to(jump)
     return jump.new_zeros(len(pixels), jump.shape[-1]).index_add(0, edges.lines.row, moved)
 
@@ -246,7 +247,6 @@ def _moved(eye: Eye, edges: _Edges) -> Tensor:
     return factor * (m - m.detach())
 
 
-@torch.enable_grad()
 def _slopes(eye: Eye, edges: _Edges) -> tuple[Tensor, Tensor, Tensor]:
     """Weights (Q, 2) of m, and m_u, m_v (Q,); without derivatives."""
     u, v = (x.detach().requires_grad_() for x in edges.lines.place(edges.rich))

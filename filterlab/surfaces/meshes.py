@@ -63,7 +63,6 @@ class Mesh:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} triangles, residual={self.residual:.1e})"
 
 
-@torch.no_grad()
 def mesh(
     surface: Surface,
     step: float = 1.0,

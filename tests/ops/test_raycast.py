@@ -99,6 +99,14 @@ def test_many_pieces_of_a_ray_are_cast_again(monkeypatch):
     assert torch.allclose(mine.near[order], all_.near, rtol=0, atol=1e-12)
 
 
+def test_no_rays():
+    field = fl.reconstruct(samples(), "triquadratic")
+    o, d = rays(field, 0)
+    for way in ("reference", "cpu"):
+        assert raycast.first(described(field), o, d, way).shape == (0,)
+        assert raycast.candidates(described(field), o, d, way).coefficients.shape == (0, 7)
+
+
 def test_threads_change_no_bit(monkeypatch):
     field = fl.reconstruct(samples(), "triquadratic")
     o, d = rays(field, 3000)

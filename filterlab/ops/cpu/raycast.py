@@ -33,11 +33,10 @@ def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
 
 def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidates:
     """`ops.reference.raycast.candidates`, fused."""
-    parts = []
-    n, capacity, left = given.lattice.degree + 1, _FEW, torch.arange(len(origins))
-    while len(left):
+    parts, capacity, left = [], _FEW, torch.arange(len(origins))
+    while len(left) or not parts:
         again = []
-        for own in left.split(max(1, _NUMBERS_AT_ONCE // (capacity * (n + 3)))):
+        for own in left.split(max(1, _NUMBERS_AT_ONCE // (capacity * (given.lattice.degree + 4)))):
             cast = _Cast(given, "candidates", origins[own], directions[own])
             count, part = cast.candidates(capacity, own)
             parts.append(part)
