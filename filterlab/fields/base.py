@@ -266,11 +266,14 @@ def _checked_origin(origin: Sequence[float]) -> tuple[float, float, float]:
     return x, y, z
 
 
+_COMPUTED = torch.float32, torch.float64
+
+
 def check_points(points: Tensor, channels: tuple[int, int] | None) -> Tensor:
     """The points in their compute type, promote(points, float32). Raises on a wrong type or shape."""
     if not isinstance(points, Tensor):
         raise TypeError(f"points must be a torch.Tensor; got {type(points).__name__}")
-    if points.dtype.is_complex or points.dtype == torch.bool:
+    if points.dtype not in _COMPUTED and (points.dtype.is_complex or points.dtype == torch.bool):
         raise TypeError(f"points must be real numbers; got {points.dtype}")
     if points.ndim == 0 or points.shape[-1] != 3:
         raise ValueError(f"points must have shape (..., 3) in x, y, z order; got {tuple(points.shape)}")
@@ -278,8 +281,9 @@ def check_points(points: Tensor, channels: tuple[int, int] | None) -> Tensor:
         raise ValueError(
             f"a batched field needs points of shape (N, ..., 3), N = {channels[0]} or 1; got {tuple(points.shape)}"
         )
-    dtype = torch.promote_types(points.dtype, torch.float32)
-    return points if points.dtype == dtype else points.to(dtype)  # `to` takes a microsecond to do nothing
+    if points.dtype in _COMPUTED:  # asked first: to find the type and convert to it takes microseconds to do nothing
+        return points
+    return points.to(torch.promote_types(points.dtype, torch.float32))
 
 
 def check_order(order: int, max_order: int) -> None:

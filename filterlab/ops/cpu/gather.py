@@ -245,7 +245,7 @@ class Program:
         """The job of these points in chunks of so many blocks."""
         entries, count, _ = points.shape
         job = self.job.copy(points=points, rows=rows, **arrays)
-        assert all((job.points, job.rows)), "tensors without memory"
+        assert None not in (job.points, job.rows), "tensors without memory"
         chunk = blocks * BLOCK
         job.count, job.entries, job.points_entry = count, entries, points.stride(0)
         job.chunk, job.chunks = chunk, -(-count // (self.lanes * chunk)) * entries
