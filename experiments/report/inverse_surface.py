@@ -86,7 +86,8 @@ def _convergence(records: Sequence[Record]) -> Plot:
             axes.set_title(title, fontsize=8)
             axes.set_xlabel("iteration")
             axes.set_xlim(left=0)
-            if axes.dataLim.ymax > 0:
+            values = [value for r in records for _, value in _course(r, quantity)]
+            if values and 0 < min(values) < max(values):  # else there is nothing that a logarithm could show
                 plots.logarithmic(axes)
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
