@@ -24,7 +24,7 @@ from filterlab.ops.differentiable.prefilter import implementation_for, prefilter
 from filterlab.ops.pieces import Lattice, Pieces
 from filterlab.ops.place import Placement
 from filterlab.ops.raycast import Candidates, Raycast
-from filterlab.ops.reference.pieces import pieces_of_rays
+from filterlab.ops.reference.pieces import in_cells, pieces_of_rays
 from filterlab.ops.stencil import Product, Stencil
 from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary, Geometry, Volume
@@ -302,9 +302,8 @@ class GridField(Field):
     def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
         self._check_pieces()
         dtype = _type_of_rays(origins, directions)
-        lattice, geometry = self.lattice, self.domain.geometry
-        own = geometry.to_voxel(origins.detach().double()), geometry.direction_to_voxel(directions.detach().double())
-        rays = own[0] - own[0].new_tensor(lattice.offset), own[1]
+        lattice = self.lattice
+        rays = in_cells(origins, directions, self.domain.geometry, lattice)
         if level is None or not lattice.continuous:  # a jump may lie between bricks that hold no level
             return pieces_of_rays(rays, lattice, dtype)
         bounds = ranges(lattice)
@@ -319,11 +318,9 @@ class GridField(Field):
     def _raycast(self, level: float, origins: Tensor, directions: Tensor) -> Raycast:
         self._check_pieces()
         dtype = _type_of_rays(origins, directions)
-        lattice, geometry = self.lattice, self.domain.geometry
+        lattice = self.lattice
         bounds = ranges(lattice)
-        return Raycast(
-            lattice, geometry.origin, geometry.inverse, level, dtype, bounds.clear(level, dtype), bounds.edge
-        )
+        return Raycast(lattice, self.domain.geometry, level, dtype, bounds.clear(level, dtype), bounds.edge)
 
     @property
     def _caster(self) -> str | None:

@@ -56,3 +56,8 @@ def readable(tensor: Tensor, outer: int) -> Tensor:
     tensor = tensor.detach().resolve_neg()
     together = tensor[(0,) * outer].is_contiguous()
     return tensor if together else tensor.contiguous()
+
+
+def extent(tensor: Tensor) -> int:
+    """Numbers from the first of a tensor to its last, in memory; of one that has any."""
+    return 1 + sum((n - 1) * stride for n, stride in zip(tensor.shape, tensor.stride(), strict=True))

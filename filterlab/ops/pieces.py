@@ -52,10 +52,14 @@ class Pieces(NamedTuple):
 
     def t(self, within: Tensor) -> Tensor:
         """t (P, …) in units of the direction from the origin, of parameters `within` pieces in [0, 1]; ∞ stays."""
-        extra = (1,) * (within.ndim - 1)
-        start, near, far = (x.view(-1, *extra) for x in (self.start[self.ray], self.near, self.far))
-        part = torch.where(within.isfinite(), within, 0).double()
-        return torch.where(within.isfinite(), start + torch.lerp(near, far, part), torch.inf)
+        return along_ray(self.start[self.ray], self.near, self.far, within)
+
+
+def along_ray(start: Tensor, near: Tensor, far: Tensor, within: Tensor) -> Tensor:
+    """t (P, …) of parameters in [0, 1] of pieces from near to far (P,), measured from start (P,); ∞ stays."""
+    start, near, far = (x.view(-1, *(1,) * (within.ndim - 1)) for x in (start, near, far))
+    found = within < torch.inf
+    return torch.where(found, start + torch.lerp(near, far, torch.where(found, within, 0).double()), torch.inf)
 
 
 @dataclass(frozen=True)
@@ -79,14 +83,19 @@ class Lattice:
     shift: float = 0.0
 
     @cached_property
+    def stencil(self) -> Stencil:
+        """The one row."""
+        return Stencil((self.row,))
+
+    @property
     def supports(self) -> tuple[int, int, int]:
         """Taps of a cell along x, y, z."""
-        return Stencil((self.row,)).supports
+        return self.stencil.supports
 
-    @cached_property
+    @property
     def exact(self) -> bool:
         """Whether all kernels are fixed tables."""
-        return Stencil((self.row,)).exact
+        return self.stencil.exact
 
     @cached_property
     def degrees(self) -> tuple[int, int, int]:

@@ -16,9 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from filterlab.ops.pieces import Lattice, Triple
-
-MAX_DEGREE = 9  # along a ray
+from filterlab.ops.pieces import Lattice, along_ray
+from filterlab.volume import Geometry
 
 _RADII = (1, 2, 4, 8)  # bricks around an empty one that are told to be empty as well
 
@@ -43,9 +42,7 @@ class Candidates(NamedTuple):
 
     def t(self, within: Tensor) -> Tensor:
         """(Q, …) in units of the direction, of parameters in [0, 1]; ∞ stays."""
-        start, near, far = (x.view(-1, *(1,) * (within.ndim - 1)) for x in (self.start, self.near, self.far))
-        found = within < torch.inf
-        return torch.where(found, start + torch.lerp(near, far, torch.where(found, within, 0).double()), torch.inf)
+        return along_ray(self.start, self.near, self.far, within)
 
 
 def joined(parts: Sequence[Candidates]) -> Candidates:
@@ -59,7 +56,7 @@ class Raycast:
 
     Attributes:
         lattice: where f is one polynomial, and which.
-        origin, matrix: coordinates of cells are matrix · (world − origin) − lattice.offset.
+        geometry: where it lies in the world; coordinates of cells are those of voxels − lattice.offset.
         level: f = level is what is hit.
         dtype: of the rays and of polynomials, float32 or float64.
         clear: (bz, by, bx) uint8, of bricks of `edge`³ cells: 0 where the brick may hold the level, else 1 + r, where
@@ -68,8 +65,7 @@ class Raycast:
     """
 
     lattice: Lattice
-    origin: Triple
-    matrix: tuple[Triple, ...]
+    geometry: Geometry
     level: float
     dtype: torch.dtype
     clear: Tensor

@@ -23,7 +23,7 @@ from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.cells import Found, Walk
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, I8, I32, I64, STORAGE, Lanes, Value
-from filterlab.ops.cpu.polynomials import Part, Rows, Search
+from filterlab.ops.cpu.polynomials import FirstRoot, Part, Rows
 from filterlab.ops.cpu.restriction import Restriction
 from filterlab.ops.cpu.taps import Grid
 from filterlab.ops.stencil import Lowered
@@ -132,7 +132,7 @@ class _Program:
         no_ends = DOUBLE(0.0), DOUBLE(0.0), DOUBLE(0.0)
         grid = Grid(j.width, j.height, I64(0), no_ends, no_ends)
         self.restriction = Restriction(e, v.stencil, v.degree, self.storage, grid, v.room)
-        self.search = Search(e, v.degree)
+        self.search = FirstRoot(e, v.degree)
         self.walk = Walk(self.places, j)
         self._ended_at = self.places.variable(self.places.constant(-1))
         self._ended_with = e.variable(e.constant(0))

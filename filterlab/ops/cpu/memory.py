@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from filterlab.ops.gather import extent
+
 ARITHMETIC = {torch.float32: "float32", torch.float64: "float64"}
 
 _SMALL = 1 << 18  # bytes; what numpy allocates costs 3 µs more, which counts for few points
@@ -40,6 +42,6 @@ def zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
 
 
 def has_room(tensor: Tensor) -> bool:
-    """Whether the storage of a contiguous tensor goes on behind it, by a number at least."""
-    size = tensor.element_size()
-    return tensor.untyped_storage().nbytes() >= (tensor.storage_offset() + tensor.numel() + 1) * size
+    """Whether the storage of a tensor goes on behind its last number, by another at least."""
+    end = tensor.storage_offset() + extent(tensor)
+    return tensor.untyped_storage().nbytes() >= (end + 1) * tensor.element_size()

@@ -9,7 +9,8 @@ parts that are halved until the coefficients change their sign once at most.
     several                          halves
     several, where floats end        a root within rounding: the part is kept
 
-So a double root costs halvings, some thirty at most, and nothing that is found later has to be compared with it.
+So a double root costs halvings, at most as many as floats have digits, and nothing that is found later has to be
+compared with it.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class Part:
             variable.value = e.where(mask, value, variable.value)
 
 
-class Search:
+class FirstRoot:
     """Writes the search. Make it before any loop.
 
     Args:
@@ -176,7 +177,7 @@ class Search:
         e, b = self.lanes, self.builder
         zero, half = e.constant(0), e.constant(0.5)
         rows_, sizes = [e.kept(r) for r in rows], [e.kept(e.absolute(r)) for r in rows]
-        low, high, last = e.variable(e.constant(1e-300 if e.bits == 64 else 1e-37)), e.variable(e.constant(1)), None
+        low, high = e.variable(e.constant(1e-300 if e.bits == 64 else 1e-37)), e.variable(e.constant(1))
         start = rows[0]
         for r in rows[1:]:
             start = e.add(start, r)

@@ -14,10 +14,9 @@ from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.crossings import JUMP, PACKS_OF_A_CHUNK, REPEATED, RaycastJob, RaycastVariant
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.machine import lanes_of
-from filterlab.ops.cpu.memory import ARITHMETIC
+from filterlab.ops.cpu.memory import ARITHMETIC, has_room
 from filterlab.ops.gather import STORAGE
 from filterlab.ops.raycast import Candidates, Raycast, joined
-from filterlab.ops.stencil import Stencil
 
 _FEW = 4  # candidates of a ray at first; those with more are cast again
 _NUMBERS_AT_ONCE = 1 << 24  # of candidates
@@ -81,12 +80,12 @@ def _variant(given: Raycast, asked: str, coefficients: Tensor) -> RaycastVariant
     lattice = given.lattice
     return RaycastVariant(
         asked,
-        Stencil((lattice.row,)).lowered,
+        lattice.stencil.lowered,
         lattice.degree,
         lattice.continuous,
         ARITHMETIC[given.dtype],
         STORAGE[coefficients.dtype],
-        _has_room(coefficients),
+        has_room(coefficients),
         lanes_of(given.dtype),
     )
 
@@ -104,8 +103,14 @@ def _job(given: Raycast, coefficients: Tensor) -> RaycastJob:
     for axis, cells, bricks in zip(AXES, lattice.cells, given.clear.shape[::-1], strict=True):
         setattr(job, f"cells_{axis}", cells)
         setattr(job, f"bricks_{axis}", bricks)
-    numbers = {"origin": given.origin, "offset": lattice.offset, "lower": lattice.lower, "upper": lattice.upper}
-    arrays = {name: torch.tensor(x, dtype=torch.float64) for name, x in (numbers | {"matrix": given.matrix}).items()}
+    numbers = {
+        "origin": given.geometry.origin,
+        "matrix": given.geometry.inverse,
+        "offset": lattice.offset,
+        "lower": lattice.lower,
+        "upper": lattice.upper,
+    }
+    arrays = {name: torch.tensor(x, dtype=torch.float64) for name, x in numbers.items()}
     job.point(coefficients=coefficients, clear=given.clear.contiguous(), **arrays)
     return job
 
@@ -116,9 +121,3 @@ def _readable(coefficients: Tensor) -> Tensor:
     plane, row, one = values.stride()
     whole = one == 1 and row > 0 and plane % max(row, 1) == 0
     return values if whole else values.contiguous()
-
-
-def _has_room(values: Tensor) -> bool:
-    """Whether the storage goes on behind the last coefficient."""
-    last = sum((n - 1) * stride for n, stride in zip(values.shape, values.stride(), strict=True))
-    return values.untyped_storage().nbytes() >= (values.storage_offset() + last + 2) * values.element_size()

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from filterlab.ops import cpu
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.raycast import Candidates, Raycast
-from filterlab.ops.stencil import Stencil
 
 
 def missing(given: Raycast, origins: Tensor) -> str | None:
     """What keeps the program from running here as asked; None: nothing does."""
     if transforming():
         return "it has no transforms of torch.func"
-    lattice = given.lattice
-    if problem := cpu.missing(
-        lattice.coefficients.detach()[None, None], origins[None].to(given.dtype), Stencil((lattice.row,))
-    ):
+    points = torch.empty(1, 0, 3, dtype=given.dtype, device=origins.device)
+    if problem := cpu.missing(given.lattice.coefficients.detach()[None, None], points, given.lattice.stencil):
         return problem
     if given.clear.numel() >= 1 << 31:
         return f"up to {1 << 31} bricks; got {given.clear.numel()}"

@@ -24,8 +24,10 @@ from torch import Tensor
 
 from filterlab import bernstein
 from filterlab.kernels import PiecewisePolynomial
+from filterlab.ops.gather import extent
 from filterlab.ops.pieces import Lattice, Pieces, Triple
 from filterlab.ops.stencil import Product
+from filterlab.volume import Geometry
 
 CHUNK = 1 << 13  # pieces restricted at a time: their taps stay in the cache
 _NO_MOTION = 1e-30  # of the largest component: over any distance that float64 resolves, such an axis stays put
@@ -186,12 +188,8 @@ def _taps(values: Tensor, cells: Tensor, supports: Sequence[int]) -> Tensor:
     z, y, x = (torch.arange(s, device=device) * stride for s, stride in zip((sz, sy, sx), strides, strict=True))
     offsets = (z[:, None, None] + y[:, None] + x).flatten()
     first = (cells * torch.tensor(strides[::-1], device=device)).sum(-1)
-    flat = torch.as_strided(values, (_extent(values),), (1,))
+    flat = torch.as_strided(values, (extent(values),), (1,))
     return flat[first[:, None] + offsets].view(-1, sz, sy, sx)
-
-
-def _extent(values: Tensor) -> int:
-    return 1 + sum((n - 1) * stride for n, stride in zip(values.shape, values.stride(), strict=True))
 
 
 def _product(taps: Tensor, product: Product, start: Tensor, end: Tensor) -> Tensor:
@@ -231,6 +229,12 @@ def _table(kernel: PiecewisePolynomial, start: Tensor, end: Tensor) -> Tensor:
     ends = (bernstein.on_interval(u)[:, None] for u in (start, end))
     restricted = bernstein.restrict(taps, *ends)
     return restricted * start.new_tensor([comb(kernel.degree, j) for j in range(kernel.degree + 1)])
+
+
+def in_cells(origins: Tensor, directions: Tensor, geometry: Geometry, lattice: Lattice) -> tuple[Tensor, Tensor]:
+    """Rays (R, 3) in the world, in coordinates of cells; float64, without derivatives."""
+    own = geometry.to_voxel(origins.detach().double())
+    return own - own.new_tensor(lattice.offset), geometry.direction_to_voxel(directions.detach().double())
 
 
 def pieces_of_rays(

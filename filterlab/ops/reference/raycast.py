@@ -14,7 +14,7 @@ from torch import Tensor
 
 from filterlab.ops.pieces import Pieces
 from filterlab.ops.raycast import Candidates, Raycast, joined
-from filterlab.ops.reference.pieces import pieces_of_rays
+from filterlab.ops.reference.pieces import in_cells, pieces_of_rays
 from filterlab.roots import first_root
 
 PIECES_AT_ONCE = 1 << 19  # at most, of as many rays as may have so many
@@ -40,9 +40,7 @@ def _found(given: Raycast) -> Search:
 def _pieces(given: Raycast, origins: Tensor, directions: Tensor) -> Pieces:
     """The pieces of rays (R, 3) in bricks that may hold the level."""
     lattice = given.lattice
-    numbers = given.matrix, given.origin, lattice.offset
-    matrix, origin, offset = (torch.tensor(x, dtype=torch.float64, device=origins.device) for x in numbers)
-    own = (origins.double() - origin) @ matrix.T - offset, directions.double() @ matrix.T
+    own = in_cells(origins, directions, given.geometry, lattice)
     return pieces_of_rays(own, lattice, given.dtype, given.edge, given.clear == 0)
 
 
