@@ -87,6 +87,29 @@ def test_float32_is_rounded_only(method):
         assert float(same[(other < torch.inf) & (found < torch.inf)].double().mean()) > 0.998
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("method", METHODS)
+def test_neighbouring_pieces_share_their_ends_to_the_bit(method, dtype):
+    field = fl.reconstruct(fl.Volume(samples(), affine=AFFINE), method)
+    found = raycast.candidates(described(field, dtype), *rays(field, 2000, dtype), "cpu")
+    order = found.ray.argsort(stable=True)
+    ray, near, far, c = (x[order] for x in (found.ray, found.near, found.far, found.coefficients))
+    joined = (ray[1:] == ray[:-1]) & (near[1:] == far[:-1])
+    assert int(joined.sum()) > 100
+    assert torch.equal(c[1:][joined, 0], c[:-1][joined, -1])
+
+
+@pytest.mark.parametrize("way", ["reference", "cpu"])
+def test_a_level_that_is_reached_where_the_domain_ends_is_hit_there(way):
+    """Coefficients 1 and −1 meet at the last face, half of each: 0, to the bit, and nothing follows."""
+    line = torch.tensor([-1.0, 3, 3, 3, 3, 1], dtype=torch.float64)
+    field = fl.reconstruct(line.expand(4, 4, 6), "triquadratic", boundary="wrap", prefilter=False)
+    o, d = torch.tensor([[2.2, 1.3, 1.6]], dtype=torch.float64), torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    given = field._raycast(0.0, o, d)
+    assert raycast.candidates(given, o, d, way).coefficients[-1, -1] == 0
+    assert torch.allclose(raycast.first(given, o, d, way), o.new_tensor([5.5 - 2.2]), rtol=0, atol=1e-12)
+
+
 def test_many_pieces_of_a_ray_are_cast_again(monkeypatch):
     """Eight of one ray find room at first, then eight times as many, and none is lost or told twice."""
     field = fl.reconstruct(samples(3, (5, 5, 90)), "trilinear")
