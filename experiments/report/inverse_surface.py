@@ -65,7 +65,9 @@ def _view(records: Sequence[Record], view: str, folder: Path) -> Gallery:
             picture(folder, images["target"], "target"),
             picture(folder, images["start"], "start"),
             picture(folder, images["result"], "result", _name(r)),
+            picture(folder, images["start_error"], "error of the start"),
             picture(folder, images["target_normal"], "normals of the target"),
+            picture(folder, images["start_normal"], "normals of the start"),
             picture(folder, images["result_normal"], "normals of the result", _name(r)),
             picture(folder, images["result_error"], "error of the result", _name(r)),
         ]
@@ -73,7 +75,7 @@ def _view(records: Sequence[Record], view: str, folder: Path) -> Gallery:
         "Two rows for each recovery. Normals as ½ + ½ n. Errors: grey, differences of depth where both hit, white from "
         "0.1 world units on; red, hit where the target is not; blue, missed where it is."
     )
-    return Gallery(pictures, caption, columns=3)
+    return Gallery(pictures, caption, columns=4)
 
 
 def _convergence(records: Sequence[Record]) -> Plot:
