@@ -14,6 +14,7 @@ from filterlab.ops.differentiable.prefilter import implementation_for, prefilter
 from filterlab.prefilters import PREFILTERS
 from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.roots import all_roots, first_root
+from filterlab.surfaces import LevelSet
 from filterlab.volume import Boundary, Volume
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU that torch can use")
@@ -136,3 +137,41 @@ def test_roots(degree: int) -> None:
     assert torch.equal(found.isfinite(), expected.isfinite())
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
     assert torch.equal(all_roots(c.cuda()).count.cpu(), all_roots(c).count)
+
+
+def _hits(device: str, method: str, dtype: torch.dtype) -> dict[str, Tensor]:
+    """First hits of rays with a rough level set, its geometry, all crossings, and derivatives."""
+    n = 3000
+    x = samples(dtype)[0, 0].to(device).requires_grad_()
+    gradient = "analytic" if method == "trilinear" else None
+    field = reconstruct(Volume(x, spacing=(0.5, 1.0, 0.8)), method, gradient=gradient)
+    surface = LevelSet(field, 0.5)
+    ends = torch.rand((2, n, 3), generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    origins = (ends[0] * 20 - 8).to(dtype).to(device).requires_grad_()
+    directions = ((ends[1] * 5).to(dtype).to(device) - origins.detach()).requires_grad_()
+    hit = surface.hit(origins, directions)
+    at = surface.at(origins, directions, hit, order=1)
+    depth = torch.where(hit.valid, hit.t, 0)
+    steep = hit.valid & ((at.normal * directions).sum(-1).abs() > 0.2)  # derivatives grow without bound on grazing rays
+    weighed = torch.where(steep, depth, 0).square().sum() + torch.where(steep[:, None], at.normal, 0).sin().sum()
+    found = torch.autograd.grad(weighed, (x, origins))
+    counts = surface.hits(origins.detach(), directions.detach(), sheets=6).valid.sum(-1)
+    normal = torch.where(steep[:, None], at.normal, 0)
+    return {"t": depth, "normal": normal, "volume": found[0], "origins": found[1], "counts": counts, "steep": steep}
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+@pytest.mark.parametrize("method", METHODS)
+def test_hits_and_their_derivatives(method: str, dtype: torch.dtype) -> None:
+    """A ray or two of float32 may graze the level, and pass on one device."""
+    expected, found = _hits("cpu", method, dtype), _hits("cuda", method, dtype)
+    assert expected["steep"].sum() > 500
+    other = (expected["counts"] != found["counts"].cpu()) | (expected["steep"] != found["steep"].cpu())
+    exact = dtype == torch.float64
+    assert other.sum() <= (0 if exact else 6)
+    for name in ("t", "normal", "origins") + (("volume",) if exact else ()):
+        a, b = expected[name].double(), found[name].cpu().double()
+        if name != "volume":
+            a, b = a[~other], b[~other]
+        limit = (1e-9 if exact else 2e-3) * float(a.detach().abs().max())
+        torch.testing.assert_close(b, a, rtol=0, atol=limit, msg=lambda t, name=name: f"{name}: {t}")

@@ -16,12 +16,14 @@ import torch
 from torch import Tensor
 
 from benchmarks import workloads
+from benchmarks.comparisons import surfaces
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item
 from benchmarks.peers import cupy_march, cupy_ndimage, cupy_texture
 from benchmarks.scene import Scene, blobs, marschner_lobb, without_skipping
 from benchmarks.settings import Settings
 from filterlab import ops
 from filterlab.kernels import bspline
+from filterlab.methods import METHODS
 from filterlab.ops.differentiable.prefilter import prefilter_samples
 from filterlab.roots import first_root
 
@@ -206,6 +208,49 @@ def _adjoint(settings: Settings, edge: int, schemes: Sequence[str]) -> Race:
     return Race(f"{_described(scene)}: gradients to volume and table", contestants, ratios, tolerance=1e-2)
 
 
+# --- level sets -------------------------------------------------------------------------------------------------------
+
+
+def _hits(settings: Settings) -> Race:
+    """First hits and normals by every method, and the program alone for one of them."""
+    task = surfaces.task_of(settings, _IMAGE * settings.image, device="cuda")
+    rays = task.origins, task.directions
+    contestants = [
+        _finished(
+            method, partial(surfaces.hits_and_normals, surfaces.surface_of(task, method), task), None, len(rays[0])
+        )
+        for method in METHODS
+    ]
+    surface = surfaces.surface_of(task, "triquadratic")
+    contestants.append(
+        _finished("program", lambda: (surface.field.first_crossing(*rays, task.level),), None, len(rays[0]))
+    )
+    what = f"{surfaces.described(task)}: first hits and normals; triquadratic hits alone: program"
+    return Race(what, contestants, [Ratio("triquadratic", "trilinear"), Ratio("triquadratic", "program")])
+
+
+def _hits_direct(settings: Settings) -> Race:
+    task = surfaces.task_of(settings, settings.image // 4, device="cuda")
+
+    def cast(scheme: str) -> Callable[[], Any]:
+        surface = surfaces.surface_of(task, "triquadratic", scheme)
+        return lambda: tuple(x.nan_to_num(posinf=0) for x in surfaces.hits_and_normals(surface, task))
+
+    contestants = [_finished(scheme, cast(scheme), "hits", len(task.origins)) for scheme in ("fused", "direct")]
+    return Race(surfaces.described(task), contestants, [Ratio("fused", "direct")], tolerance=1e-2)
+
+
+def _hits_adjoint(settings: Settings) -> Race:
+    task = surfaces.task_of(settings, _IMAGE * settings.image, device="cuda")
+    forward, both = surfaces.ways_of(task)
+    contestants = [
+        _finished("forward", forward, None, len(task.origins)),
+        _finished("both ways", both, None, len(task.origins)),
+    ]
+    what = f"{surfaces.described(task)}: gradients of depths and normals to samples and origins, triquadratic"
+    return Race(what, contestants, [Ratio("both ways", "forward")])
+
+
 # --- roots ------------------------------------------------------------------------------------------------------------
 
 
@@ -231,6 +276,9 @@ _ITEMS: dict[str, tuple[float, Callable[[Settings], Race]]] = {
     "skipping": (5, _skipping),
     "adjoint": (5, partial(_adjoint, edge=2, schemes=("fused",))),
     "adjoint-direct": (20, lambda s: _adjoint(replace(s, image=s.image // 2), 1, ("fused", "direct"))),
+    "hits": (5, _hits),
+    "hits-direct": (20, _hits_direct),
+    "hits-adjoint": (5, _hits_adjoint),
     "roots-float32": (10, partial(_roots, dtype=torch.float32)),
     "roots-float64": (10, partial(_roots, dtype=torch.float64)),
 }

@@ -8,6 +8,7 @@ from itertools import cycle
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from benchmarks.comparisons.scaling import thread_numbers
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item, usable_cores
@@ -19,43 +20,47 @@ from benchmarks.settings import Settings
 from filterlab.methods import METHODS, reconstruct
 from filterlab.surfaces import LevelSet
 
-_LEVEL = 0.5
-_LEVELS = (0.48, 0.49, 0.5, 0.51, 0.52)
+LEVEL = 0.5
+LEVELS = (0.48, 0.49, 0.5, 0.51, 0.52)
 _BARS = {"trilinear": at_most("0.25"), "triquadratic": at_most("0.45"), "tricubic": at_most("0.9")}
 _PLAIN = 64  # pixels along an edge of what plain torch casts
 
 
-def _task(settings: Settings, size: int | None = None, voxels: int | None = None) -> Casting:
+def task_of(settings: Settings, size: int | None = None, voxels: int | None = None, device: str = "cpu") -> Casting:
     scene = marschner_lobb(voxels or settings.image_voxels, size or 2 * settings.image)
     origins, directions = scene.camera.rays(scene.size, scene.size)
     origins, directions = (x.expand(directions.shape).reshape(-1, 3).float() for x in (origins, directions))
-    return Casting(scene.volume, _LEVEL, origins.contiguous(), directions.contiguous(), settings.threads)
+    volume, origins, directions = (x.contiguous().to(device) for x in (scene.volume, origins, directions))
+    return Casting(volume, LEVEL, origins, directions, settings.threads)
 
 
-def _described(task: Casting) -> str:
+def described(task: Casting) -> str:
     n = task.volume.shape[-1]
     return f"Marschner-Lobb {n}³ float32, level {task.level:g}, {len(task.origins):,} rays"
 
 
-def _surface(task: Casting, method: str, scheme: str = "fused") -> LevelSet:
+def surface_of(task: Casting, method: str, scheme: str = "fused") -> LevelSet:
     gradient = "analytic" if method == "trilinear" else None
     return LevelSet(reconstruct(task.volume, method, scheme=scheme, gradient=gradient), task.level)
 
 
+def hits_and_normals(surface: LevelSet, task: Casting) -> tuple[Tensor, Tensor]:
+    hit = surface.hit(task.origins, task.directions)
+    normal = surface.at(task.origins, task.directions, hit).normal
+    assert normal is not None
+    return hit.t, normal
+
+
 def _hits(task: Casting, method: str, scheme: str = "fused", name: str | None = None) -> Contestant:
     """First hits and normals."""
-    surface = _surface(task, method, scheme)
-
-    def call() -> Any:
-        hit = surface.hit(task.origins, task.directions)
-        return hit.t, surface.at(task.origins, task.directions, hit).normal
-
+    surface = surface_of(task, method, scheme)
+    call = lambda: hits_and_normals(surface, task)  # noqa: E731
     computes = task.computes if method == "trilinear" else f"{method} hits"
     return Contestant(name or method, call, computes, lambda found: task.summary(found[0].numpy()), len(task.origins))
 
 
 def _first(settings: Settings) -> Race:
-    task = _task(settings)
+    task = task_of(settings)
     contestants, absent, ratios = [_hits(task, method) for method in METHODS], {}, []
     for peer in casters():
         if why := peer.missing():
@@ -66,68 +71,68 @@ def _first(settings: Settings) -> Race:
         ratios += [Ratio(method, mitsuba_sdfgrid.NAME, bar) for method, bar in _BARS.items()]
     if embree_mesh.NAME not in absent:
         ratios.append(Ratio("triquadratic", embree_mesh.NAME, at_most("2")))
-    what = f"{_described(task)}: first hits and normals; {embree_mesh.NAME} without"
+    what = f"{described(task)}: first hits and normals; {embree_mesh.NAME} without"
     return Race(what, contestants, ratios, tolerance=2e-3, absent=absent)
 
 
 def _new_level(settings: Settings) -> Race:
     """Another level in every call: nothing that was found out for one serves the next."""
-    task = _task(settings)
+    task = task_of(settings)
     field = reconstruct(task.volume, "triquadratic")
-    levels = cycle(_LEVELS)
+    levels = cycle(LEVELS)
 
-    def call() -> Any:
-        surface = LevelSet(field, next(levels))
-        hit = surface.hit(task.origins, task.directions)
-        return hit.t, surface.at(task.origins, task.directions, hit).normal
-
+    call = lambda: hits_and_normals(LevelSet(field, next(levels)), task)  # noqa: E731
     contestants = [Contestant("triquadratic", call, samples=len(task.origins))]
-    what = f"{_described(task)}: from a new level to hits (and normals)"
+    what = f"{described(task)}: from a new level to hits (and normals)"
     if why := embree_mesh.missing():
         return Race(what, contestants, absent={embree_mesh.NAME: why})
-    other: Iterator[float] = cycle(_LEVELS)
+    other: Iterator[float] = cycle(LEVELS)
     contestants.append(embree_mesh.new_level(task, lambda: next(other)))
     return Race(what, contestants, [Ratio("triquadratic", contestants[1].name, at_most("1/3"))])
 
 
 def _plain(settings: Settings) -> Race:
     """Fewer rays: plain torch takes some 0.2 ms for each."""
-    task = _task(settings, min(_PLAIN, settings.image))
+    task = task_of(settings, min(_PLAIN, settings.image))
     contestants, ratios = [], []
     for method in METHODS:
         contestants += [_hits(task, method, scheme, f"{method}, {scheme}") for scheme in ("fused", "direct")]
         ratios.append(Ratio(f"{method}, fused", f"{method}, direct", at_most("1/30")))
-    return Race(f"{_described(task)}: first hits and normals", contestants, ratios)
+    return Race(f"{described(task)}: first hits and normals", contestants, ratios)
 
 
-def _backward(settings: Settings) -> Race:
-    """Of samples that are new in every call, as in a descent: coefficients and bounds are made anew either way."""
-    task = _task(settings)
+def ways_of(task: Casting) -> tuple[Callable[[], Any], Callable[[], Any]]:
+    """Depths and normals forward, and with gradients to samples and origins.
+
+    Of samples that are new in every call, as in a descent: coefficients and bounds are made anew either way.
+    """
     volume, origins = task.volume.clone().requires_grad_(), task.origins.clone().requires_grad_()
 
     def forward() -> Any:
         surface = LevelSet(reconstruct(volume, "triquadratic"), task.level)
-        hit = surface.hit(origins, task.directions)
-        at = surface.at(origins, task.directions, hit)
-        assert at.normal is not None
-        return torch.where(hit.valid, hit.t, 0).sum() + at.normal.sum()
+        t, normal = hits_and_normals(surface, replace(task, origins=origins))
+        return torch.where(t < torch.inf, t, 0).sum() + normal.sum()
 
     def alone() -> Any:
         with torch.no_grad():
             return forward()
 
+    return alone, lambda: torch.autograd.grad(forward(), (volume, origins))
+
+
+def _backward(settings: Settings) -> Race:
+    task = task_of(settings)
+    forward, both = ways_of(task)
     contestants = [
-        Contestant("forward", alone, samples=len(origins)),
-        Contestant(
-            "forward + backward", lambda: torch.autograd.grad(forward(), (volume, origins)), samples=len(origins)
-        ),
+        Contestant("forward", forward, samples=len(task.origins)),
+        Contestant("forward + backward", both, samples=len(task.origins)),
     ]
     ratios = [Ratio("forward + backward", "forward", at_most("3"))]
-    return Race(f"{_described(task)}: gradients of depths and normals to samples and origins", contestants, ratios)
+    return Race(f"{described(task)}: gradients of depths and normals to samples and origins", contestants, ratios)
 
 
 def _threads(settings: Settings) -> Race:
-    task = _task(settings)
+    task = task_of(settings)
     numbers = thread_numbers(usable_cores())
     contestants = [_on(threads, _hits(task, "triquadratic")) for threads in numbers]
     ratios = [
@@ -135,7 +140,7 @@ def _threads(settings: Settings) -> Race:
         for n, c in zip(numbers[1:], contestants[1:], strict=True)
     ]
     absent = {} if len(numbers) > 1 else {"2 threads": "one core only"}
-    return Race(f"{_described(task)}: first hits and normals on threads", contestants, ratios, absent=absent)
+    return Race(f"{described(task)}: first hits and normals on threads", contestants, ratios, absent=absent)
 
 
 def _on(threads: int, c: Contestant) -> Contestant:
@@ -148,16 +153,16 @@ def _on(threads: int, c: Contestant) -> Contestant:
 
 def _growth(settings: Settings, what: str) -> Race:
     """Twice as many pixels, or voxels, along an edge."""
-    task = _task(settings)
+    task = task_of(settings)
     size, voxels = 2 * settings.image, settings.image_voxels
     cases: dict[str, Callable[[], Casting]] = {
-        "pixels": lambda: _task(settings, size // 2),
-        "voxels": lambda: _task(settings, size, voxels // 2),
+        "pixels": lambda: task_of(settings, size // 2),
+        "voxels": lambda: task_of(settings, size, voxels // 2),
     }
     small = _hits(cases[what](), "triquadratic", name=f"half the {what} along an edge")
     large = _hits(task, "triquadratic", name="all")
     contestants = [replace(c, computes=None) for c in (small, large)]
-    return Race(f"{_described(task)}: first hits and normals", contestants, [Ratio("all", small.name)])
+    return Race(f"{described(task)}: first hits and normals", contestants, [Ratio("all", small.name)])
 
 
 def _items(settings: Settings) -> list[Item]:

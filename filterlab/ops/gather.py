@@ -58,6 +58,14 @@ def readable(tensor: Tensor, outer: int) -> Tensor:
     return tensor if together else tensor.contiguous()
 
 
+def in_whole_rows(coefficients: Tensor) -> Tensor:
+    """The same (D, H, W), in rows that lie together and planes of whole rows."""
+    values = coefficients.detach().resolve_neg()
+    plane, row, one = values.stride()
+    whole = one == 1 and row > 0 and plane % max(row, 1) == 0
+    return values if whole else values.contiguous()
+
+
 def extent(tensor: Tensor) -> int:
     """Numbers from the first of a tensor to its last, in memory; of one that has any."""
     return 1 + sum((n - 1) * stride for n, stride in zip(tensor.shape, tensor.stride(), strict=True))

@@ -9,7 +9,7 @@ restrict only those that their bricks' bounds leave over.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,7 +19,11 @@ from torch import Tensor
 from filterlab.ops.pieces import Lattice, along_ray
 from filterlab.volume import Geometry
 
+JUMP, REPEATED = 1, 2  # bits of `Written.flags`
+
 _RADII = (1, 2, 4, 8)  # bricks around an empty one that are told to be empty as well
+_FEW = 4  # candidates of a ray at first; those with more are cast again
+_NUMBERS_AT_ONCE = 1 << 24  # of candidates
 
 
 class Candidates(NamedTuple):
@@ -48,6 +52,59 @@ class Candidates(NamedTuple):
 def joined(parts: Sequence[Candidates]) -> Candidates:
     """One after the other."""
     return Candidates(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+
+
+class Written(NamedTuple):
+    """What programs write of R rays with room for K candidates each.
+
+    Attributes:
+        count: (R,) int64, candidates of a ray, also those that there is no room for.
+        places: (R, K, 3) float64: start, near, far.
+        pieces: (R, K, n + 1) coefficients.
+        flags: (R, K) bytes of `JUMP` and `REPEATED`.
+    """
+
+    count: Tensor
+    places: Tensor
+    pieces: Tensor
+    flags: Tensor
+
+    @classmethod
+    def room(cls, given: Raycast, rays: int, capacity: int) -> Written:
+        """To be written."""
+        device, numbers = given.lattice.coefficients.device, given.lattice.degree + 1
+        return cls(
+            torch.zeros(rays, dtype=torch.int64, device=device),
+            torch.empty(rays, capacity, 3, dtype=torch.float64, device=device),
+            torch.empty(rays, capacity, numbers, dtype=given.dtype, device=device),
+            torch.empty(rays, capacity, dtype=torch.uint8, device=device),
+        )
+
+    def candidates(self, rays: Tensor) -> Candidates:
+        """Those of the rays that have no more than there is room for; `rays` says which rays they are."""
+        capacity = self.flags.shape[1]
+        here = torch.arange(capacity, device=rays.device) < torch.where(self.count > capacity, 0, self.count)[:, None]
+        flags, (start, near, far) = self.flags[here], self.places[here].unbind(-1)
+        ray = rays[:, None].expand(-1, capacity)[here]
+        return Candidates(ray, start, near, far, self.pieces[here], (flags & JUMP) > 0, (flags & REPEATED) > 0)
+
+
+def written_in_parts(write: Callable[[Tensor, int], Written], given: Raycast, rays: int) -> Candidates:
+    """All candidates of so many rays, a part of them at a time; rays that have more than there was room for come later.
+
+    Args:
+        write: of rays, by their numbers, with room for so many candidates each.
+    """
+    parts, capacity = [], _FEW
+    left = torch.arange(rays, device=given.lattice.coefficients.device)
+    while len(left) or not parts:
+        again = []
+        for own in left.split(max(1, _NUMBERS_AT_ONCE // (capacity * (given.lattice.degree + 4)))):
+            written = write(own, capacity)
+            parts.append(written.candidates(own))
+            again.append(own[written.count > capacity])
+        left, capacity = torch.cat(again), 8 * capacity
+    return joined(parts)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, I8, I32, I64, STORAGE, L
 from filterlab.ops.cpu.polynomials import FirstRoot, Part, Rows
 from filterlab.ops.cpu.restriction import Restriction
 from filterlab.ops.cpu.taps import Grid
+from filterlab.ops.raycast import JUMP, REPEATED
 from filterlab.ops.stencil import Lowered
 
 PACKS_OF_A_CHUNK = 16
@@ -58,8 +59,6 @@ FIELDS: dict[str, type] = {
     "flags": ctypes.c_void_p,  # (R, K) bytes, written: 1 the field jumps over the level, 2 the piece is a repetition
     "chunks": ctypes.c_int64,  # `next` stops here
 }
-
-JUMP, REPEATED = 1, 2
 
 
 class RaycastJob(job.Job):

@@ -11,15 +11,12 @@ from torch import Tensor
 
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
-from filterlab.ops.cpu.crossings import JUMP, PACKS_OF_A_CHUNK, REPEATED, RaycastJob, RaycastVariant
+from filterlab.ops.cpu.crossings import PACKS_OF_A_CHUNK, RaycastJob, RaycastVariant
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.cpu.memory import ARITHMETIC, has_room
-from filterlab.ops.gather import STORAGE
-from filterlab.ops.raycast import Candidates, Raycast, joined
-
-_FEW = 4  # candidates of a ray at first; those with more are cast again
-_NUMBERS_AT_ONCE = 1 << 24  # of candidates
+from filterlab.ops.gather import STORAGE, in_whole_rows
+from filterlab.ops.raycast import Candidates, Raycast, Written, written_in_parts
 
 
 def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
@@ -32,24 +29,23 @@ def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
 
 def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidates:
     """`ops.reference.raycast.candidates`, fused."""
-    parts, capacity, left = [], _FEW, torch.arange(len(origins))
-    while len(left) or not parts:
-        again = []
-        for own in left.split(max(1, _NUMBERS_AT_ONCE // (capacity * (given.lattice.degree + 4)))):
-            cast = _Cast(given, "candidates", origins[own], directions[own])
-            count, part = cast.candidates(capacity, own)
-            parts.append(part)
-            again.append(own[count > capacity])
-        left, capacity = torch.cat(again), 8 * capacity
-    return joined(parts)
+
+    def write(rays: Tensor, capacity: int) -> Written:
+        written = Written.room(given, len(rays), capacity)
+        cast = _Cast(given, "candidates", origins[rays], directions[rays])
+        cast.job.capacity = capacity
+        cast.run(**written._asdict())
+        return written
+
+    return written_in_parts(write, given, len(origins))
 
 
 class _Cast:
     """A lattice and rays as a job."""
 
     def __init__(self, given: Raycast, asked: str, origins: Tensor, directions: Tensor) -> None:
-        self.dtype, self.rays, self.degree = given.dtype, len(origins), given.lattice.degree
-        coefficients = _readable(given.lattice.coefficients)
+        self.dtype, self.rays = given.dtype, len(origins)
+        coefficients = in_whole_rows(given.lattice.coefficients)
         self.function = compiler.compiled(_variant(given, asked, coefficients))
         self.job = _job(given, coefficients)
         self.job.rays = self.rays
@@ -61,19 +57,6 @@ class _Cast:
         packs = -(-self.rays // lanes_of(self.dtype))
         job.next, job.chunks = 0, -(-packs // PACKS_OF_A_CHUNK)
         pool.run(self.function, [job] * max(1, min(torch.get_num_threads(), job.chunks)))
-
-    def candidates(self, capacity: int, rays: Tensor) -> tuple[Tensor, Candidates]:
-        """How many each ray has, and those of the rays that have no more than there is room for."""
-        count = torch.zeros(self.rays, dtype=torch.int64)
-        places = torch.empty(self.rays, capacity, 3, dtype=torch.float64)
-        pieces = torch.empty(self.rays, capacity, self.degree + 1, dtype=self.dtype)
-        flags = torch.empty(self.rays, capacity, dtype=torch.uint8)
-        self.job.capacity = capacity
-        self.run(count=count, places=places, pieces=pieces, flags=flags)
-        written = torch.arange(capacity) < torch.where(count > capacity, 0, count)[:, None]
-        flags, (start, near, far) = flags[written], places[written].unbind(-1)
-        ray = rays[:, None].expand(-1, capacity)[written]
-        return count, Candidates(ray, start, near, far, pieces[written], (flags & JUMP) > 0, (flags & REPEATED) > 0)
 
 
 def _variant(given: Raycast, asked: str, coefficients: Tensor) -> RaycastVariant:
@@ -113,11 +96,3 @@ def _job(given: Raycast, coefficients: Tensor) -> RaycastJob:
     arrays = {name: torch.tensor(x, dtype=torch.float64) for name, x in numbers.items()}
     job.point(coefficients=coefficients, clear=given.clear.contiguous(), **arrays)
     return job
-
-
-def _readable(coefficients: Tensor) -> Tensor:
-    """The same, in rows that lie together and planes of whole rows."""
-    values = coefficients.detach().resolve_neg()
-    plane, row, one = values.stride()
-    whole = one == 1 and row > 0 and plane % max(row, 1) == 0
-    return values if whole else values.contiguous()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from filterlab.ops import cpu
+from filterlab.ops import cpu, cuda
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.raycast import Candidates, Raycast
@@ -16,7 +16,8 @@ def missing(given: Raycast, origins: Tensor) -> str | None:
     if transforming():
         return "it has no transforms of torch.func"
     points = torch.empty(1, 0, 3, dtype=given.dtype, device=origins.device)
-    if problem := cpu.missing(given.lattice.coefficients.detach()[None, None], points, given.lattice.stencil):
+    room = cuda if _implementation_for(given) == "cuda" else cpu
+    if problem := room.missing(given.lattice.coefficients.detach()[None, None], points, given.lattice.stencil):
         return problem
     if given.clear.numel() >= 1 << 31:
         return f"up to {1 << 31} bricks; got {given.clear.numel()}"
@@ -27,7 +28,7 @@ def first(given: Raycast, origins: Tensor, directions: Tensor, implementation: s
     """t (R,) float64, where rays (R, 3) first meet the level; ∞ where they don't. Without derivatives.
 
     Args:
-        implementation: "reference" or "cpu"; None: the fastest that can run.
+        implementation: "reference", "cpu" or "cuda"; None: the fastest that can run.
     """
     return _driver(given, origins, implementation).first(given, origins, directions)
 
@@ -39,5 +40,10 @@ def candidates(given: Raycast, origins: Tensor, directions: Tensor, implementati
 
 def _driver(given: Raycast, origins: Tensor, implementation: str | None):
     if implementation is None:
-        implementation = "cpu" if missing(given, origins) is None else "reference"
+        implementation = _implementation_for(given) if missing(given, origins) is None else "reference"
     return driver(implementation, "raycast")
+
+
+def _implementation_for(given: Raycast) -> str:
+    """What casts rays at these coefficients: "cpu" (vector code), or "cuda" (Triton) on a GPU."""
+    return "cuda" if given.lattice.coefficients.device.type == "cuda" else "cpu"
