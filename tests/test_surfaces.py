@@ -309,7 +309,7 @@ def test_rays_of_any_shape_and_memory_by_parts(scheme, monkeypatch):
     sheets = surface.hits(origins, directions, 3)
     monkeypatch.setattr("filterlab.surfaces.level_set.RAYS_AT_ONCE", 7)
     monkeypatch.setattr("filterlab.ops.reference.raycast.PIECES_AT_ONCE", 100)
-    monkeypatch.setattr("filterlab.ops.cpu.raycast._NUMBERS_AT_ONCE", 100)
+    monkeypatch.setattr("filterlab.ops.raycast._NUMBERS_AT_ONCE", 100)
     shaped = origins.reshape(3, 4, 5, 3), directions.reshape(3, 4, 5, 3)
     assert torch.equal(surface.hit(*shaped).t, t.reshape(3, 4, 5))
     several = surface.hits(*shaped, 3)

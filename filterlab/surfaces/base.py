@@ -166,7 +166,7 @@ class Surface(ABC):
             ValueError: an order that the field cannot give; hits of other rays.
         """
         check_order(order, self.max_order)
-        origins, directions = check_rays(origins, directions)
+        origins, directions = _broadcast(origins, directions)
         shape, rays = hit.t.shape, origins.shape[:-1]
         if shape == (*rays, *shape[len(rays) :]) and len(shape) == len(rays) + 1:
             origins, directions = origins[..., None, :], directions[..., None, :]
@@ -222,11 +222,10 @@ class Surface(ABC):
     def _polished(self, origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
         """o + t d; far from where rays begin moved along them by what it was rounded by."""
         point = _along(origins, directions, t)
-        ways = origins.detach().abs(), (t.detach()[:, None] * directions.detach()).abs()
         near = _FAR * (self.domain.diagonal + max(map(abs, self.domain.center)))
-        if not len(t) or max(float(way.max()) for way in ways) <= near:
+        if not len(t) or max(map(abs, torch.stack(origins.detach().aminmax()).tolist())) <= near:
             return point
-        far = torch.maximum(*ways).amax(-1) > near
+        far = origins.detach().abs().amax(-1) > near  # t d leads as far, for what is hit is near
         moved = self.detached._nearer(point.detach()[far], directions.detach()[far]).detach()
         return point.index_add(0, far.nonzero()[:, 0], moved)
 
@@ -294,18 +293,25 @@ def check_sheets(sheets: int) -> None:
 
 def check_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """Both (..., 3), broadcast, in promote(origins, directions, float32). Raises what `Surface.hit` says."""
+    rays = _broadcast(origins, directions)
     for name, x in (("origins", origins), ("directions", directions)):
-        if not isinstance(x, Tensor) or not x.dtype.is_floating_point:
-            found = x.dtype if isinstance(x, Tensor) else type(x).__name__
-            raise TypeError(f"{name} must be a floating-point torch.Tensor; got {found}")
-        if x.ndim == 0 or x.shape[-1] != 3:
-            raise ValueError(f"{name} must have shape (..., 3) in x, y, z order; got {tuple(x.shape)}")
         if not _all_finite(x.detach()):
             wrong = int((~x.detach().isfinite()).any(-1).sum())
             raise ValueError(f"{name} must be finite; {wrong} rays are not")
     some_zero = int(directions.detach().count_nonzero()) < directions.numel()
     if some_zero and (none := int((directions.detach() == 0).all(-1).sum())):
         raise ValueError(f"directions must not be zero; {none} rays have none")
+    return rays
+
+
+def _broadcast(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """The same; whatever their numbers are."""
+    for name, x in (("origins", origins), ("directions", directions)):
+        if not isinstance(x, Tensor) or not x.dtype.is_floating_point:
+            found = x.dtype if isinstance(x, Tensor) else type(x).__name__
+            raise TypeError(f"{name} must be a floating-point torch.Tensor; got {found}")
+        if x.ndim == 0 or x.shape[-1] != 3:
+            raise ValueError(f"{name} must have shape (..., 3) in x, y, z order; got {tuple(x.shape)}")
     dtype = torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
     try:
         origins, directions = torch.broadcast_tensors(origins.to(dtype), directions.to(dtype))
@@ -346,7 +352,7 @@ def _chosen(index: Tensor, shape: torch.Size, *rows: Tensor) -> list[Tensor]:
 def _spread(rows: Sequence[Tensor], index: Tensor, shape: torch.Size) -> list[Tensor]:
     """Rows (M, …) at flat places of (*shape, …), 0 elsewhere."""
     joined = torch.cat([row.flatten(1) for row in rows], 1)
-    out = joined.new_zeros(shape.numel(), joined.shape[1]).index_copy(0, index, joined)
+    out = joined.new_zeros(shape.numel(), joined.shape[1]).index_copy_(0, index, joined)
     parts = out.split([math.prod(row.shape[1:]) for row in rows], 1)
     return [part.reshape(*shape, *row.shape[1:]) for part, row in zip(parts, rows, strict=True)]
 

@@ -18,7 +18,7 @@ from filterlab.ops.cuda import crossings, launch
 from filterlab.ops.cuda import raycast as cuda
 from filterlab.ops.differentiable import raycast
 from filterlab.ops.raycast import Raycast
-from tests.ops.test_raycast import AFFINE, described, rays, samples
+from tests.ops.test_raycast import AFFINE, described, rays, rays_on_the_last_faces, samples
 
 FEW, MANY = 33, 20_000  # the interpreter takes 50 ms for a ray; 33 are more than a program has
 
@@ -96,6 +96,13 @@ def test_float32_is_rounded_only(method: str, device: str) -> None:
     both = (expected < torch.inf) & (found < torch.inf)
     assert float(((expected < torch.inf) == (found < torch.inf)).double().mean()) > 0.998
     assert float(((expected - found)[both].abs() < 1e-4).double().mean()) > 0.998
+
+
+def test_rays_on_the_last_faces_of_the_domain(device: str) -> None:
+    field, o, d = rays_on_the_last_faces()
+    given = field._raycast(3.0, o, d)
+    found = cuda.first(on(device, given), o.to(device), d.to(device)).cpu()
+    assert torch.allclose(found, raycast.first(given, o, d, "reference"), rtol=0, atol=1e-12)
 
 
 def test_no_rays(device: str) -> None:

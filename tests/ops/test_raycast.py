@@ -110,6 +110,26 @@ def test_a_level_that_is_reached_where_the_domain_ends_is_hit_there(way):
     assert torch.allclose(raycast.first(given, o, d, way), o.new_tensor([5.5 - 2.2]), rtol=0, atol=1e-12)
 
 
+def rays_on_the_last_faces() -> tuple[GridField, Tensor, Tensor]:
+    """Of a sheet y = 3 between clear bricks, the last of which are cut off by the end of the domain."""
+    y = torch.arange(7, dtype=torch.float64)[:, None].expand(7, 7, 7)
+    field = fl.reconstruct(y, "triquadratic", boundary="border", prefilter=False)
+    end = field.domain.upper[0]
+    o = torch.tensor([[end, -9.0, 2.2], [end, 14.0, end], [2.2, -0.5, end], [end, end, 1.0], [end, 6.0, 0.7]])
+    d = torch.tensor([[0.0, 1.0, 0.0], [0.0, -2.0, 0.0], [0.0, 1.0, 0.0], [-0.1, -1.0, 0.0], [0.0, -1.0, 0.3]])
+    return field, o.double(), d.double()
+
+
+def test_rays_on_the_last_faces_of_the_domain():
+    """Over clear bricks they were led out of the lattice, once: a place on the end is that of no cell."""
+    field, o, d = rays_on_the_last_faces()
+    given = field._raycast(3.0, o, d)
+    assert (given.clear > 0).any()
+    expected = raycast.first(given, o, d, "reference")
+    assert (expected < torch.inf).all()
+    assert torch.allclose(raycast.first(given, o, d, "cpu"), expected, rtol=0, atol=1e-12)
+
+
 def test_many_pieces_of_a_ray_are_cast_again(monkeypatch):
     """Eight of one ray find room at first, then eight times as many, and none is lost or told twice."""
     field = fl.reconstruct(samples(3, (5, 5, 90)), "trilinear")

@@ -212,7 +212,7 @@ class Walk:
             at = e.to_integer(e.floor(e.multiply_add(reached, self.direction[i].value, self.entry[i].value)))
             low = b.shl(b.sub(brick[i], radius), edge)
             high = b.sub(b.shl(b.add(brick[i], clear), edge), self._integers(1))
-            at = self._smaller(self._larger(at, low), high)
+            at = self._smaller(self._larger(at, low), self._smaller(high, self._last(i)))  # also on the domain's end
             cells.append(b.select(through, b.add(plane[i], self._backward[i].value), at))
             self._cell[i].value = b.select(moves, cells[i], cell[i])
         self._s.value = e.where(moves, reached, before)

@@ -21,7 +21,7 @@ from filterlab.ops.raycast import Candidates, Raycast, Written, written_in_parts
 
 def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
     """`ops.reference.raycast.first`, fused: t (R,) float64 of rays (R, 3), without derivatives."""
-    t = torch.full((len(origins),), torch.inf, dtype=torch.float64)
+    t = torch.empty(len(origins), dtype=torch.float64)
     if len(t):
         _Cast(given, "first", origins, directions).run(t=t)
     return t

@@ -173,7 +173,7 @@ class Walk:
         for a in AXES:
             line(f"place = tl.floor(reached * direction_{a} + entry_{a})")
             line(f"lowest = (brick_{a} - (known - 1)) << edge")
-            line(f"highest = ((brick_{a} + known) << edge) - 1")
+            line(f"highest = tl.minimum(((brick_{a} + known) << edge) - 1, cells_{a} - 1)  # also on the domain's end")
             line(f"whole_place = {self._within('place.to(tl.int32)', 'lowest', 'highest')}")
             line(f"next_{a} = tl.where(through_{a}, plane_{a} + backward_{a}, whole_place)")
             line(f"over = over | {self._outside(a)}")

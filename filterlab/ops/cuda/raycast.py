@@ -22,7 +22,7 @@ from filterlab.ops.raycast import Candidates, Raycast, Written, written_in_parts
 
 def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
     """`ops.reference.raycast.first`, fused: t (R,) float64 of rays (R, 3), without derivatives."""
-    t = torch.full((len(origins),), torch.inf, dtype=torch.float64, device=origins.device)
+    t = torch.empty(len(origins), dtype=torch.float64, device=origins.device)
     _cast(given, "first", origins, directions, {"t": t})
     return t
 
