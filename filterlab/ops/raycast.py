@@ -21,7 +21,7 @@ from filterlab.volume import Geometry
 
 JUMP, REPEATED = 1, 2  # bits of `Written.flags`
 
-_RADII = (1, 2, 4, 8)  # bricks around an empty one that are told to be empty as well
+_RADII = (1, 2, 3, 4, 5, 6, 7, 8)  # bricks around an empty one that are told to be empty as well
 _FEW = 4  # candidates of a ray at first; those with more are cast again
 _NUMBERS_AT_ONCE = 1 << 24  # of candidates
 

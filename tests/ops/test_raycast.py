@@ -184,9 +184,9 @@ def test_clear_bricks_are_as_far_from_the_others_as_is_said():
     g = torch.Generator().manual_seed(0)
     relevant = torch.rand(21, 6, 47, generator=g) < 0.001
     clear = clear_of(relevant)
-    assert set(clear.unique().tolist()) == {0, 1, 2, 3, 5, 9}
+    assert set(clear.unique().tolist()) == set(range(10))
     where = relevant.nonzero()
     for brick in torch.randint(0, 1 << 30, (400, 3), generator=g).remainder(torch.tensor(relevant.shape)):
         distance = int((where - brick).abs().amax(1).min())
-        expected = max((1 + r for r in (0, 1, 2, 4, 8) if r < distance), default=0)
+        expected = max((1 + r for r in range(9) if r < distance), default=0)
         assert clear[tuple(brick)] == expected

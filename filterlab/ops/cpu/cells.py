@@ -209,7 +209,7 @@ class Walk:
         reached = e.maximum(self._least(crossed), before)
         cells = []
         for i, through in enumerate(self._through(crossed)):
-            at = e.to_integer(e.floor(e.multiply_add(reached, self.direction[i].value, self.entry[i].value)))
+            at = e.to_integer(e.multiply_add(reached, self.direction[i].value, self.entry[i].value))
             low = b.shl(b.sub(brick[i], radius), edge)
             high = b.sub(b.shl(b.add(brick[i], clear), edge), self._integers(1))
             at = self._smaller(self._larger(at, low), self._smaller(high, self._last(i)))  # also on the domain's end

@@ -26,7 +26,7 @@ from filterlab.ops.cpu.lanes import I8, Lanes, Value, Variable
 
 _ROUNDINGS = 3  # τ = 3 n ε
 _PASSES = 120  # of Newton's method and bisection
-_USUAL = 4  # passes before a value that may be rounding decides anything
+_USUAL = 2  # passes before a value that may be rounding decides anything
 
 Rows = list[Value]
 """Coefficients, packs."""

@@ -15,7 +15,7 @@ from filterlab.ops.cuda.source import Source, number
 
 _ROUNDINGS = 3  # τ = 3 n ε
 _PASSES = 120  # of Newton's method and bisection
-_USUAL = 4  # passes before a value that may be rounding decides anything
+_USUAL = 2  # passes before a value that may be rounding decides anything
 EPS = {"float32": 2.0**-23, "float64": 2.0**-52}
 TINY = {"float32": 2.0**-126, "float64": 2.0**-1022}
 
