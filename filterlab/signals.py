@@ -7,12 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import lru_cache
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from filterlab.fields.base import Domain, Field, check_order, check_points
+from filterlab.fields.crossings import RAYS_AT_ONCE, Along, Bounds, crossings, stepped
+from filterlab.ops.pieces import Pieces
+from filterlab.ops.raycast import Candidates, joined
+from filterlab.ops.reference.pieces import inside
 from filterlab.volume import Geometry, Volume
 
 ValueAndGradient = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -22,11 +29,23 @@ Corner = tuple[float, float, float]
 class Signal(Field):
     """A closed-form function of space.
 
+    Its level sets are found along rays by what is known of it, the first of these that is given:
+
+        degree   it is one polynomial along a ray: every crossing is a root of that
+        bounds   intervals are halved until bounds decide: every crossing (`filterlab.fields.crossings`)
+        step     places no farther apart than that are compared: of crossings nearer to each other pairs may be lost
+
     Args:
         name: what error messages and reports call it.
         value_and_gradient: points `(..., 3)` -> (value `(...)`, exact gradient `(..., 3)`), differentiable torch code.
         lower, upper: corners of the box it is looked at in, x, y, z.
         voxel_size: nominal voxel edge, the unit of a renderer's step; default 1/64 of the longest edge of the box.
+        degree: in x, y and z together, if it is a polynomial.
+        bounds: of its derivatives in the box.
+        step: in world units.
+
+    Raises:
+        ValueError: a size or a step that is not positive; a degree below 0.
     """
 
     def __init__(
@@ -36,16 +55,94 @@ class Signal(Field):
         lower: Corner = (-1.0, -1.0, -1.0),
         upper: Corner = (1.0, 1.0, 1.0),
         voxel_size: float | None = None,
+        *,
+        degree: int | None = None,
+        bounds: Bounds | None = None,
+        step: float | None = None,
     ) -> None:
         self.name = name
         self._function = value_and_gradient
         size = max(b - a for a, b in zip(lower, upper, strict=True)) / 64 if voxel_size is None else voxel_size
-        _require_positive(voxel_size=size)
+        _require_positive(voxel_size=size, **({} if step is None else {"step": step}))
+        if degree is not None and (isinstance(degree, bool) or not isinstance(degree, int) or degree < 0):
+            raise ValueError(f"degree must be an integer ≥ 0; got {degree!r}")
         self.domain = Domain(lower, upper, Geometry(), size)
+        self._degree, self.bounds, self.step = degree, bounds, step
 
     def with_voxel_size(self, voxel_size: float) -> Signal:
         """The same signal with another nominal voxel edge."""
-        return Signal(self.name, self._function, self.domain.lower, self.domain.upper, voxel_size)
+        _require_positive(voxel_size=voxel_size)
+        changed = copy(self)
+        changed.domain = replace(self.domain, voxel_size=voxel_size)
+        return changed
+
+    # --- along rays ---
+
+    @property
+    def degree_along_rays(self) -> int | None:
+        return None if self._degree is None else max(self._degree, 1)
+
+    @property
+    def search(self) -> str | None:
+        if self._degree is not None:
+            return super().search
+        if self.bounds is not None:
+            return f"exact: halved until bounds decide, down to {self.bounds.resolution:.0e} of a ray's way"
+        return None if self.step is None else f"in steps of {self.step:g}: pairs of crossings between two may be lost"
+
+    def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
+        """One piece a ray, through its values at n + 1 places."""
+        n = self.degree_along_rays
+        if n is None:
+            raise self._no_pieces()
+        lines, ray, start = inside(origins.double(), directions.double(), self.domain.lower, self.domain.upper)
+        places, matrix = (torch.tensor(x, device=origins.device, dtype=torch.float64) for x in _interpolation(n))
+        t = lines.far[:, None] * places
+        values = self(lines.origins[:, None] + t[..., None] * lines.directions[:, None])
+        dtype = torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
+        return Pieces(ray, lines.near, lines.far, (values @ matrix.T).to(dtype), start)
+
+    def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
+        if self._degree is not None:
+            return super().first_crossing(origins, directions, level)
+        t = torch.full((len(origins),), math.inf, dtype=torch.float64, device=origins.device)
+        for part in _parts(len(origins)):
+            found = self._crossings(origins[part], directions[part], level, first=True)
+            t[part] = t[part].scatter_reduce(0, found.ray, found.start + found.near, "amin")
+        return t
+
+    def crossing_candidates(self, origins: Tensor, directions: Tensor, level: float) -> Candidates:
+        """Each crossing that is no root of a piece, as a piece of no length that begins with its root."""
+        if self._degree is not None:
+            return super().crossing_candidates(origins, directions, level)
+        found = []
+        for part in _parts(len(origins)):
+            own = self._crossings(origins[part], directions[part], level, first=False)
+            found.append(own._replace(ray=own.ray + part.start))
+        return joined(found)
+
+    def _crossings(self, origins: Tensor, directions: Tensor, level: float, first: bool) -> Candidates:
+        lines, met, start = inside(origins.double(), directions.double(), self.domain.lower, self.domain.upper)
+        speed = lines.directions.norm(dim=-1)
+
+        def along(ray: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+            d = lines.directions[ray]
+            value, gradient = self._function(lines.origins[ray] + t[:, None] * d)
+            return value.detach() - level, (gradient.detach() * d).sum(-1)
+
+        ray, t = self._found(along, lines.far, speed, first)
+        ray = met[ray]
+        root, never = t.new_tensor([0.0, 1.0]).expand(len(t), 2), torch.zeros_like(ray, dtype=torch.bool)
+        return Candidates(ray, start[ray], t, t, root, never, never)
+
+    def _found(self, along: Along, length: Tensor, speed: Tensor, first: bool) -> tuple[Tensor, Tensor]:
+        if self.bounds is not None:
+            return crossings(along, length, speed, self.bounds, first)
+        if self.step is not None:
+            return stepped(along, length, speed, self.step)
+        raise self._no_pieces()
+
+    # --- at points ---
 
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         """Value, exact gradient and (by automatic differentiation of the gradient) Hessian."""
@@ -87,6 +184,21 @@ class Signal(Field):
             self(torch.stack(torch.broadcast_tensors(axes[0], axes[1][:, None], z), -1)).to(dtype) for z in axes[2]
         ]
         return Volume(torch.stack(planes), spacing=spacing, origin=origin)
+
+
+def _parts(rays: int) -> list[slice]:
+    return [slice(first, first + RAYS_AT_ONCE) for first in range(0, rays, RAYS_AT_ONCE)] or [slice(0, 0)]
+
+
+@lru_cache
+def _interpolation(degree: int) -> tuple[tuple[float, ...], tuple[tuple[float, ...], ...]]:
+    """Places in [0, 1], and the matrix from values there to the Bernstein coefficients of the one polynomial."""
+    angle = (2 * torch.arange(degree + 1, dtype=torch.float64) + 1) * math.pi / (2 * degree + 2)
+    places = (1 - angle.cos()) / 2
+    powers = torch.arange(degree + 1)
+    choose = torch.tensor([math.comb(degree, i) for i in range(degree + 1)], dtype=torch.float64)
+    basis = choose * places[:, None] ** powers * (1 - places[:, None]) ** (degree - powers)
+    return tuple(places.tolist()), tuple(map(tuple, torch.linalg.inv(basis).tolist()))
 
 
 def _require_positive(**parameters: float) -> None:
@@ -141,7 +253,12 @@ def marschner_lobb(frequency: float = 6.0, alpha: float = 0.25, voxel_size: floa
         along_z = -scale * math.pi / 2 * torch.cos(math.pi / 2 * z)
         return value, torch.stack((radial * x, radial * y, along_z), -1)
 
-    return Signal("marschner-lobb", function, voxel_size=voxel_size)
+    scale, fastest = 1 / (2 * (1 + alpha)), math.pi**2 * frequency
+    bounds = Bounds(
+        scale * math.hypot(alpha * fastest, math.pi / 2),
+        scale * max(alpha * (fastest**2 + math.pi / 2 * fastest), (math.pi / 2) ** 2),
+    )
+    return Signal("marschner-lobb", function, voxel_size=voxel_size, bounds=bounds)
 
 
 def franke(voxel_size: float | None = None) -> Signal:
@@ -171,7 +288,13 @@ def franke(voxel_size: float | None = None) -> Signal:
             gradient = gradient - 9 * term[..., None] * rate * torch.where(squared, 2 * u, torch.ones_like(u))
         return value, gradient
 
-    return Signal("franke", function, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), voxel_size)
+    bells = [(abs(height), rates[0]) for height, rates, _, powers in terms if powers == (2, 2, 2)]
+    flat = (20 / 49) ** 2 + 2 * 0.1**2  # |∇|² of the other exponent where it is greatest, by 9 x, 9 y and 9 z
+    bounds = Bounds(
+        9 * (sum(h * math.sqrt(2 * rate / math.e) for h, rate in bells) + 0.75 * math.sqrt(flat)),
+        81 * (sum(h * 2 * rate for h, rate in bells) + 0.75 * (flat + 2 / 49)),
+    )
+    return Signal("franke", function, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), voxel_size, bounds=bounds)
 
 
 def polynomial(
@@ -195,7 +318,8 @@ def polynomial(
                 gradient[2] = gradient[2] + c * k * x**i * y**j * z ** (k - 1)
         return value, torch.stack(gradient, -1)
 
-    return Signal("polynomial", function, lower, upper, voxel_size)
+    degree = max((sum(powers) for powers in coefficients), default=0)
+    return Signal("polynomial", function, lower, upper, voxel_size, degree=degree)
 
 
 def sphere(
@@ -214,7 +338,7 @@ def sphere(
         slope = -torch.exp(-u * u) / (math.sqrt(math.pi) * edge)
         return 0.5 * torch.erfc(u), slope[..., None] * _unit(d)
 
-    return Signal("sphere", function, voxel_size=voxel_size)
+    return Signal("sphere", function, voxel_size=voxel_size, bounds=Bounds(1 / (math.sqrt(math.pi) * edge)))
 
 
 def sphere_distance(radius: float = 0.6, center: Corner = (0.0, 0.0, 0.0), voxel_size: float | None = None) -> Signal:
@@ -226,7 +350,7 @@ def sphere_distance(radius: float = 0.6, center: Corner = (0.0, 0.0, 0.0), voxel
         d = p - p.new_tensor(center)
         return _distance(d) - radius, _unit(d)
 
-    return Signal("sphere-distance", function, voxel_size=voxel_size)
+    return Signal("sphere-distance", function, voxel_size=voxel_size, bounds=Bounds(1.0))
 
 
 def torus(radius: float = 0.55, tube: float = 0.25, voxel_size: float | None = None) -> Signal:
@@ -244,7 +368,7 @@ def torus(radius: float = 0.55, tube: float = 0.25, voxel_size: float | None = N
         value = q * q - 4 * radius * radius * (flat * flat).sum(-1)
         return value, 4 * q[..., None] * p - 8 * radius * radius * flat
 
-    return Signal("torus", function, voxel_size=voxel_size)
+    return Signal("torus", function, voxel_size=voxel_size, degree=4)
 
 
 def barth_sextic(extent: float = 1.75, voxel_size: float | None = None) -> Signal:
@@ -272,7 +396,7 @@ def barth_sextic(extent: float = 1.75, voxel_size: float | None = None) -> Signa
         slopes = 8 * (golden**2 * others - others.roll(1, -1)) - 4 * weight * ball
         return value, extent * slopes * q
 
-    return Signal("barth-sextic", function, voxel_size=voxel_size)
+    return Signal("barth-sextic", function, voxel_size=voxel_size, degree=6)
 
 
 def gaussian(sigma: float = 0.3, center: Corner = (0.0, 0.0, 0.0), voxel_size: float | None = None) -> Signal:
@@ -285,7 +409,8 @@ def gaussian(sigma: float = 0.3, center: Corner = (0.0, 0.0, 0.0), voxel_size: f
         value = torch.exp(-(d * d).sum(-1) / (2 * sigma * sigma))
         return value, -value[..., None] * d / (sigma * sigma)
 
-    return Signal("gaussian", function, voxel_size=voxel_size)
+    bounds = Bounds(math.exp(-0.5) / sigma, 1 / sigma**2)
+    return Signal("gaussian", function, voxel_size=voxel_size, bounds=bounds)
 
 
 def plane_wave(wave_vector: Corner = (4.0, 2.0, 1.0), phase: float = 0.0, voxel_size: float | None = None) -> Signal:
@@ -296,7 +421,8 @@ def plane_wave(wave_vector: Corner = (4.0, 2.0, 1.0), phase: float = 0.0, voxel_
         angle = p @ k + phase
         return torch.cos(angle), -torch.sin(angle)[..., None] * k
 
-    return Signal("plane-wave", function, voxel_size=voxel_size)
+    longest = math.hypot(*wave_vector)
+    return Signal("plane-wave", function, voxel_size=voxel_size, bounds=Bounds(longest, longest**2))
 
 
 SIGNALS: dict[str, Callable[..., Signal]] = {

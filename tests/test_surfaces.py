@@ -446,8 +446,9 @@ def test_bad_levels_are_refused(level):
 def test_fields_without_a_level_set_are_refused():
     with pytest.raises(TypeError, match="Field"):
         LevelSet(noise(3, 3, 3), 0.5)  # type: ignore[arg-type]
+    texture = fl.reconstruct(noise(3, 3, 3), "triquadratic", scheme="eight_trilinear", sampler="texture_unit")
     with pytest.raises(TypeError, match="not piecewise polynomial"):
-        LevelSet(fl.signals.marschner_lobb(), 0.5)
+        LevelSet(texture, 0.5)
     with pytest.raises(ValueError, match="select"):
         LevelSet(fl.reconstruct(noise(1, 1, 3, 3, 3), "trilinear"), 0.5)
     quintic = fl.reconstruct(noise(8, 8, 8), from_kernel(KERNELS["bspline5"]))

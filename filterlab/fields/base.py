@@ -104,6 +104,12 @@ class Field(ABC):
         """The degree of this field's pieces along a ray; None where it is not piecewise polynomial."""
         return None
 
+    @property
+    def search(self) -> str | None:
+        """How crossings of a level are found along rays, and what that guarantees; None: they are not found."""
+        degree = self.degree_along_rays
+        return None if degree is None else f"exact: roots of pieces of degree {degree}"
+
     def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
         """The exact pieces of the field on the parts of rays that lie in its domain.
 

@@ -36,11 +36,12 @@ class LevelSet(Surface):
     """The points where a field has a value: f = level.
 
     Args:
-        field: unbatched, piecewise polynomial along rays, of degree 9 at most: any method made of kernels of degree 3.
+        field: unbatched. Piecewise polynomial along rays, of degree 9 at most: any method made of kernels of degree 3,
+            or a signal that is a polynomial; or a signal with bounds or a step (`field.search` says what that finds).
         level: a finite number, or a tensor of no axes, in which hits are then differentiable.
 
     Raises:
-        TypeError: no Field; a field with no pieces. ValueError: a batched field, a higher degree, no finite level.
+        TypeError: no Field; one that is not searched. ValueError: a batched field, a higher degree, no finite level.
     """
 
     def __init__(self, field: Field, level: float | Tensor) -> None:
@@ -119,10 +120,13 @@ def _checked(field: Field) -> Field:
         raise TypeError(f"a level set is that of a Field; got {type(field).__name__}")
     if field.channels is not None:
         raise ValueError("a level set is that of one channel: `select` it from this batched field")
+    if field.search is None:
+        raise TypeError(
+            f"{type(field).__name__} ({field.scheme.name}) is not piecewise polynomial along rays, and nothing else is "
+            "known to find crossings by: a Signal is given its degree, bounds, or a step"
+        )
     degree = field.degree_along_rays
-    if degree is None:
-        raise TypeError(f"{type(field).__name__} ({field.scheme.name}) is not piecewise polynomial along rays")
-    if degree > MAX_DEGREE:
+    if degree is not None and degree > MAX_DEGREE:
         raise ValueError(f"degrees along a ray go up to {MAX_DEGREE}, kernels of degree 3; this field has {degree}")
     return field
 

@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Domain
+from filterlab.fields.crossings import root_between
 from filterlab.surfaces.base import Surface
 
 NODES_AT_ONCE = 1 << 22  # of the grid
@@ -291,26 +292,12 @@ def _inside(surface: Surface, grid: Grid, nodes: Tensor) -> tuple[Tensor, Tensor
 
 
 def _crossings(surface: Surface, start: Tensor, end: Tensor) -> Tensor:
-    """Points (M, 3) on segments where F = 0, by Chandrupatla's method, until no float lies between.
+    """Points (M, 3) on segments where F = 0, by `root_between`."""
 
-    Where rounding has both ends on one side, the surface goes through one of them within rounding: the nearer is taken.
-    """
-    from scipy.optimize.elementwise import find_root
+    def value(t: Tensor, number: Tensor) -> Tensor:
+        return _values(surface, torch.lerp(start[number], end[number], t[:, None]))
 
-    def value(t: np.ndarray, number: np.ndarray) -> np.ndarray:
-        own = torch.from_numpy(np.ascontiguousarray(number)).to(start.device)
-        part = torch.from_numpy(np.ascontiguousarray(t)).to(start.device)
-        return _values(surface, torch.lerp(start[own], end[own], part[:, None])).double().cpu().numpy()
-
-    numbers = np.arange(len(start))
-    zero, one = np.zeros(len(start)), np.ones(len(start))
-    found = find_root(value, (zero, one), args=(numbers,), tolerances={"xatol": 2.0**-53})
-    at_ends = np.where(abs(value(zero, numbers)) <= abs(value(one, numbers)), zero, one)
-    t = torch.from_numpy(np.where(found.status == _SAME_SIDE, at_ends, found.x)).to(start.device)
-    return torch.lerp(start, end, t[:, None])
-
-
-_SAME_SIDE = -1  # as scipy says it
+    return torch.lerp(start, end, root_between(value, len(start), start.device)[:, None])
 
 
 def _finished(surface: Surface, vertices: Tensor, faces: Tensor, outside: str) -> Mesh:
