@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import torch
@@ -48,12 +49,12 @@ class Domain:
         moved = tuple(a - float(b) for a, b in zip(self.geometry.origin, origin, strict=True))
         return replace(self, geometry=replace(self.geometry, origin=moved))
 
-    @property
+    @cached_property
     def center(self) -> tuple[float, float, float]:
         """World centre of the box."""
         return tuple(self.corners().mean(0).tolist())  # type: ignore[return-value]
 
-    @property
+    @cached_property
     def diagonal(self) -> float:
         """World length of the box's diagonal: the diameter of the sphere around it."""
         corners = self.corners()

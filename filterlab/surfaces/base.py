@@ -194,14 +194,14 @@ class Surface(ABC):
 
     def _attached(self, t: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
         """The same t, with derivatives."""
-        if not torch.is_grad_enabled():
+        tensors = None if transforming() else self.tensors
+        if not torch.is_grad_enabled() or (tensors is not None and not _asked(origins, directions, *tensors)):
             return t
         index = _where(t < torch.inf)
         if not len(index) or not self._follows(*_chosen(index[:1], t.shape, origins, directions, t[..., None])):
             return t
         o, d, own = _chosen(index, t.shape, origins, directions, t[..., None])
-        tensors = self.tensors
-        if tensors is None or transforming():
+        if tensors is None:
             own = self._stepped(o, d, own[:, 0])
         else:
             own = _Attached.apply(self, own[:, 0], o, d, *tensors)
@@ -325,7 +325,7 @@ def _broadcast(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 
 def _all_finite(x: Tensor) -> bool:
     """A finite sum has finite terms; finite terms may have another one."""
-    return bool(x.sum().isfinite()) or bool(x.isfinite().all())
+    return math.isfinite(float(x.sum())) or bool(x.isfinite().all())
 
 
 def _by_ray(search: Callable[[Tensor, Tensor], Tensor], origins: Tensor, directions: Tensor) -> Tensor:
@@ -336,6 +336,11 @@ def _by_ray(search: Callable[[Tensor, Tensor], Tensor], origins: Tensor, directi
 
 def _along(origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
     return origins + t[..., None] * directions
+
+
+def _asked(*tensors: Tensor) -> bool:
+    """Whether derivatives are asked by any of them."""
+    return any(x.requires_grad for x in tensors)
 
 
 def _where(mask: Tensor) -> Tensor:
