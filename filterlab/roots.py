@@ -524,12 +524,12 @@ def _crossing(rows: Rows, a: Tensor, b: Tensor, tolerance: float = 0.0) -> Tenso
 
 
 def _polished(rows: Rows, u: Tensor) -> Tensor:
-    """One step of Newton's method, where it leads nearer to a root with nothing between."""
+    """One step of Newton's method, where p falls and it leads nearer to a root with nothing between."""
     f, slope = _horner(rows, u)
     new = u - f / slope
     f_new, slope_new = _horner(rows, new)
     change = slope_new / slope
-    good = (f_new.abs() <= 0.5 * f.abs()) & (change > 0.5) & (change < 2) & (new >= 0)
+    good = (slope < 0) & (f_new.abs() <= 0.5 * f.abs()) & (change > 0.5) & (change < 2) & (new >= 0)
     return torch.where(good, new, u)
 
 

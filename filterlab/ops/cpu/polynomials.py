@@ -209,7 +209,7 @@ class FirstRoot:
         return u.value
 
     def _polished(self, rows: Rows, u: Value) -> Value:
-        """One step of Newton's method, where it leads nearer to a root with nothing between."""
+        """One step of Newton's method, where p falls and it leads nearer to a root with nothing between."""
         e, b = self.lanes, self.builder
         value, slope = self._horner(rows, u)
         new = e.subtract(u, e.divide(value, slope))
@@ -218,7 +218,8 @@ class FirstRoot:
         nearer = b.fcmp_ordered("<=", e.absolute(value_there), e.multiply(e.constant(0.5), e.absolute(value)))
         alike = b.and_(b.fcmp_ordered(">", change, e.constant(0.5)), b.fcmp_ordered("<", change, e.constant(2)))
         inside = b.and_(b.fcmp_ordered(">=", new, e.constant(0)), b.fcmp_ordered("<=", new, e.constant(1)))
-        return e.where(b.and_(nearer, b.and_(alike, inside)), new, u)
+        falls = b.fcmp_ordered("<", slope, e.constant(0))
+        return e.where(b.and_(b.and_(falls, nearer), b.and_(alike, inside)), new, u)
 
     def _horner(self, rows: Rows, u: Value) -> tuple[Value, Value]:
         """Σ rows[i] u^i and its derivative."""

@@ -173,7 +173,7 @@ class FirstRoot:
             line("k += 1")
 
     def _polish(self) -> None:
-        """One step of Newton's method, where it leads nearer to a root with nothing between."""
+        """One step of Newton's method, where p falls and it leads nearer to a root with nothing between."""
         line, rows = self.line, self.names("own")
         self._horner(rows, "u")
         line("before, steep = value, slope")
@@ -181,7 +181,7 @@ class FirstRoot:
         self._horner(rows, "new")
         line("change = slope / steep")
         line("good = (tl.abs(value) <= 0.5 * tl.abs(before)) & (change > 0.5) & (change < 2.0)")
-        line("u = tl.where(good & (new >= 0.0) & (new <= 1.0), new, u)")
+        line("u = tl.where(good & (steep < 0.0) & (new >= 0.0) & (new <= 1.0), new, u)")
 
     def _horner(self, rows: Sequence[str], u: str) -> None:
         """`value` = Σ rows[i] u^i and `slope`, its derivative."""
