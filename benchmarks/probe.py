@@ -70,6 +70,23 @@ def _image_and_gradients(voxels: int, size: int, steps: int) -> None:
     torch.autograd.grad(image.mean(), (scene.volume, scene.table))
 
 
+def casting_memory(threads: int, voxels: int, size: int) -> dict[str, float]:
+    """Peak bytes before and after the first picture of a level set: bounds, hits and normals of size² rays."""
+    import torch
+
+    from benchmarks.comparisons.surfaces import hits_and_normals, surface_of, task_of
+    from benchmarks.settings import Settings
+
+    torch.set_num_threads(threads)
+    small = task_of(Settings(), 8, 8)
+    hits_and_normals(surface_of(small, "triquadratic"), small)  # loaded and compiled
+    task = task_of(Settings(), size, voxels)
+    surface = surface_of(task, "triquadratic")
+    before = _peak()
+    hits_and_normals(surface, task)
+    return {"before": before, "peak": _peak()}
+
+
 def _peak() -> float:
     """The most memory this process has had, in bytes."""
     if sys.platform == "linux":  # ru_maxrss would be that of the process that started this one, where that had more
@@ -100,4 +117,5 @@ def first_call(methods: list[str]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps({"memory": memory, "first_call": first_call}[sys.argv[1]](**json.loads(sys.argv[2]))))
+    probes = {"memory": memory, "casting_memory": casting_memory, "first_call": first_call}
+    print(json.dumps(probes[sys.argv[1]](**json.loads(sys.argv[2]))))

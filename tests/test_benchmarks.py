@@ -338,7 +338,7 @@ def test_peers_are_asked_only_for_what_they_have():
 
 # --- every item, tiny ---
 
-PROCESSES = {"startup/triquadratic-first", "startup/tricubic-first", "dvr/memory"}
+PROCESSES = {"startup/triquadratic-first", "startup/tricubic-first", "dvr/memory", "surfaces/memory"}
 EVERY = [
     (f"{comparison.name}/{item.name}", item) for comparison in COMPARISONS.values() for item in comparison.items(TINY)
 ]
@@ -363,6 +363,8 @@ def test_each_item_has_a_name_of_its_own():
 def test_probes_measure_in_this_process_too():
     found = probe.memory(threads=1, voxels=10, size=3, steps=4)
     assert 2**20 < found["before"] <= found["peak"]
+    cast = probe.casting_memory(threads=1, voxels=10, size=3)
+    assert 2**20 < cast["before"] <= cast["peak"]
     calls = probe.first_call(["trilinear", "triquadratic"])
     assert set(calls) == {"trilinear", "triquadratic", "again"}
     assert min(calls.values()) > 0

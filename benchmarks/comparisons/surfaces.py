@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import cycle
 from typing import Any
 
@@ -11,10 +12,11 @@ import torch
 from torch import Tensor
 
 from benchmarks.comparisons.scaling import thread_numbers
-from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item, usable_cores
-from benchmarks.peers import casters, embree_mesh, mitsuba_sdfgrid
+from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, Tick, race_item, usable_cores
+from benchmarks.peers import casters, embree_mesh, mitsuba_sdfgrid, vtk_flying_edges
 from benchmarks.peers.task import Casting
-from benchmarks.records import at_least, at_most
+from benchmarks.probe import measured
+from benchmarks.records import Figure, Outcome, Spread, at_least, at_most
 from benchmarks.scene import marschner_lobb
 from benchmarks.settings import Settings
 from filterlab.methods import METHODS, reconstruct
@@ -23,6 +25,7 @@ from filterlab.surfaces import LevelSet
 LEVEL = 0.5
 LEVELS = (0.48, 0.49, 0.5, 0.51, 0.52)
 _BARS = {"trilinear": at_most("0.25"), "triquadratic": at_most("0.45"), "tricubic": at_most("0.9")}
+_PROCESSES = 3  # of which the peak memory is taken
 _PLAIN = 64  # pixels along an edge of what plain torch casts
 
 
@@ -82,13 +85,17 @@ def _new_level(settings: Settings) -> Race:
     levels = cycle(LEVELS)
 
     call = lambda: hits_and_normals(LevelSet(field, next(levels)), task)  # noqa: E731
-    contestants = [Contestant("triquadratic", call, samples=len(task.origins))]
+    contestants, absent, bars = [Contestant("triquadratic", call, samples=len(task.origins))], {}, {embree_mesh: "1/3"}
+    ratios = []
+    for peer in (embree_mesh, vtk_flying_edges):
+        if why := peer.missing():
+            absent[peer.NAME] = why
+            continue
+        other = cycle(LEVELS)
+        contestants.append(peer.new_level(task, partial(next, other)))
+        ratios.append(Ratio("triquadratic", contestants[-1].name, at_most(bars[peer]) if peer in bars else None))
     what = f"{described(task)}: from a new level to hits (and normals)"
-    if why := embree_mesh.missing():
-        return Race(what, contestants, absent={embree_mesh.NAME: why})
-    other: Iterator[float] = cycle(LEVELS)
-    contestants.append(embree_mesh.new_level(task, lambda: next(other)))
-    return Race(what, contestants, [Ratio("triquadratic", contestants[1].name, at_most("1/3"))])
+    return Race(what, contestants, ratios, absent=absent)
 
 
 def _plain(settings: Settings) -> Race:
@@ -165,6 +172,21 @@ def _growth(settings: Settings, what: str) -> Race:
     return Race(f"{described(task)}: first hits and normals", contestants, [Ratio("all", small.name)])
 
 
+def _memory(settings: Settings, tick: Tick) -> Outcome:
+    """Of bounds, hits and normals, beyond the field; in processes of their own."""
+    size, voxels = 2 * settings.image, settings.image_voxels
+    cases = {"all": (voxels, size), "half the pixels along an edge": (voxels, size // 2)}
+    cases["half the voxels along an edge"] = (voxels // 2, size)
+    figures = []
+    for done, (name, (n, edge)) in enumerate(cases.items()):
+        own = [measured("casting_memory", threads=settings.threads, voxels=n, size=edge) for _ in range(_PROCESSES)]
+        beyond = [(x["peak"] - x["before"]) / 2**20 for x in own]
+        figures.append(Figure(name=f"{name}, beyond the field", spread=Spread.of(beyond), unit="MiB"))
+        tick((done + 1) / len(cases))
+    what = f"peak memory of a first picture: bounds, first hits and normals, triquadratic, {voxels}³, {size}² rays"
+    return Outcome(name="memory", what=what, figures=tuple(figures))
+
+
 def _items(settings: Settings) -> list[Item]:
     return [
         race_item("first", 30, _first),
@@ -174,6 +196,7 @@ def _items(settings: Settings) -> list[Item]:
         race_item("threads", 5, _threads, threads=usable_cores()),
         race_item("pixels", 5, lambda s: _growth(s, "pixels")),
         race_item("voxels", 5, lambda s: _growth(s, "voxels")),
+        Item("memory", 30, _memory),
     ]
 
 

@@ -2,7 +2,8 @@
 
 A module here has `NAME`, `missing()` (why it can't take part; None: it can) and one of these: `sampling(task)`, the
 contestant for a `Sampling`, with `offers(kernel, gradient)`; `marching(scene)`, the contestant that renders a `Scene`;
-`casting(task)`, the one that casts the rays of a `Casting`. Points, coefficients and tables are handed over in the
+`casting(task)`, the one that casts the rays of a `Casting`; `new_level(task, level)`, the one that begins with a level
+each time. Points, coefficients and tables are handed over in the
 library's own form before anything is timed.
 """
 
@@ -23,6 +24,7 @@ _NAMES = (
     "vtk_raycaster",
     "mitsuba_sdfgrid",
     "embree_mesh",
+    "vtk_flying_edges",
 )
 
 PEERS: tuple[ModuleType, ...] = tuple(import_module(f"benchmarks.peers.{name}") for name in _NAMES)
