@@ -10,6 +10,7 @@ Letters: θ what is changed, h its step; z = (mean of the estimates − referenc
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -86,11 +87,12 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
     recipe, volume, parameter, quantity = config.work()[unit.key]
     scene = Scene(recipe, volume, parameter, quantity)
     how = Silhouettes(config.lines, config.parts)
-    seeds = [config.seed + k for k in range(config.estimates)]
+    first = zlib.crc32(f"{config.seed}/{unit.key}".encode())  # so that no two units share what is drawn
+    seeds = [first + k for k in range(config.estimates)]
     found = [scene.estimated(config.size, config.subpixels, how, seed) for seed in seeds]
     run.advance(0.5)
-    alone = scene.estimated(config.size, config.subpixels, None, config.seed)
-    reference = scene.differences(config.rows, config.repeats, config.seed)
+    alone = scene.estimated(config.size, config.subpixels, None, first)
+    reference = scene.differences(config.rows, config.repeats, first)
     (mean, error), (truth, doubt) = map(mean_and_error, (found, reference))
     return {
         **recipe.record(),

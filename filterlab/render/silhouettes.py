@@ -41,6 +41,7 @@ COUNTED = 64
 """Hits of a ray that are told apart: edges behind the last are not seen."""
 
 _CUT, _ROUNDS = 8, 10  # parts that what an edge lies in is cut into, and how often: L is that of 8⁻¹⁰ of it away
+_EDGES_OF_A_PART = 8  # at most: as long as what lies behind the last has another number of hits
 _AT_FACE = 1e-4  # of the domain's diagonal: a hit that vanishes farther from a face is none that left through it
 _STREAM = 1 << 48  # numbers from here on are drawn for lines, those below for subpixels
 
@@ -164,10 +165,18 @@ def swept(how: Silhouettes, eye: Eye, pixels: Tensor, seed: int) -> Tensor:
 
 
 def _found(eye: Eye, lines: _Lines, parts: int) -> _Edges:
-    low, high, which = (torch.cat(column) for column in zip(*_brackets(eye, lines, parts), strict=True))
-    lines = lines.some(which)
-    low, high = _narrowed(eye, lines, low, high)
-    return _classified(eye, lines, low, high)
+    low, end, which = (torch.cat(column) for column in zip(*_brackets(eye, lines, parts), strict=True))
+    lines, every = lines.some(which), []
+    for _ in range(_EDGES_OF_A_PART):
+        low, high = _narrowed(eye, lines, low, end)
+        every.append((lines, low, high))
+        more = eye.count(lines, high) != eye.count(lines, end)
+        lines, low, end = lines.some(more), high[more], end[more]
+        if not len(low):
+            break
+    some, low, high = zip(*every, strict=True)
+    lines = _Lines(*(torch.cat(column) for column in zip(*some, strict=True)))
+    return _classified(eye, lines, torch.cat(low), torch.cat(high))
 
 
 def _brackets(eye: Eye, lines: _Lines, parts: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
