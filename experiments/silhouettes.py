@@ -135,8 +135,7 @@ class Depth(Material):
 class Scene:
     """An image of a volume that one number θ changes, at θ = 0.
 
-    A `ball` is −|x|², which all methods but the trilinear reproduce but for a constant; `bumps` adds noise, so that
-    parts hide parts; `cut` is `bumps` in a region that cuts it open.
+    A `ball` is −|x|² / 10; `bumps` adds noise, so that parts hide parts; `cut` is `bumps` in a region that cuts it open.
     """
 
     recipe: Recipe
