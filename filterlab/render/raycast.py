@@ -195,7 +195,7 @@ def raycast(
         shadows,
         dtype,
     )
-    at_once = max(sheets, silhouettes.lines if silhouettes else 1)
+    at_once = max(sheets, silhouettes.lines * silhouettes.parts if silhouettes else 1)
     canvas = Canvas(seen, None, torch.is_grad_enabled(), sum(CHANNELS[name] for name in asked))
     with reporting(progress, seen.count) as report:
 
