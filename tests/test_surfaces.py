@@ -14,6 +14,7 @@ from filterlab import surfaces
 from filterlab.fields.base import Field
 from filterlab.kernels import KERNELS
 from filterlab.methods import METHODS, from_kernel
+from filterlab.render import PerspectiveCamera
 from filterlab.surfaces import LevelSet
 from tests import laws, ray_oracle
 
@@ -368,39 +369,47 @@ def test_what_a_field_cannot_give_is_refused():
 # ---- derivatives
 
 
+CAMERA = ([-9.0, 2.2, 3.1], [2.5, 2.4, 2.6], 12.0)  # position, target, field of view
+
+
+def camera_rays(shift: Tensor, tilt: Tensor, position: Tensor, target: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+    """A pixel's ray, moved and turned."""
+    view = PerspectiveCamera(position=position, target=target, field_of_view=angle)
+    origins, directions = view.pixel_rays(torch.tensor([1]), 3, 3)
+    return origins + shift, 1.5 * directions + 0.1 * tilt
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_gradients_and_second_derivatives(method):
-    """t, point and normal in samples, level and rays, at the default tolerances."""
-    samples = (ball(6) / 4 + 0.3 * noise(6, 6, 6)).requires_grad_()
-    level = torch.tensor(-1.1, dtype=torch.float64, requires_grad=True)
-    origins = torch.tensor([[-3.0, 2.2, 2.9]], dtype=torch.float64, requires_grad=True)
-    directions = torch.tensor([[1.5, 0.1, -0.1]], dtype=torch.float64, requires_grad=True)
-    weights = torch.linspace(-1, 1, 216, dtype=torch.float64).reshape(6, 6, 6).cos()
+    """t, point and normal in samples, level, rays and the camera that these come from, at the default tolerances."""
+    numbers = (-1.1, [[0.1, 0.2, -0.1]], [[0.5, 0.05, -0.05]], *CAMERA)
+    assert_differentiable(method, 1, camera_rays, *numbers)
 
-    def seen(amount, level, origins, directions):
-        field = fl.reconstruct(samples.detach() + amount * weights, method, scheme="direct")
-        surface = LevelSet(field, level)
+
+@pytest.mark.parametrize("method", [name for name in METHODS if METHODS[name].facts.continuity >= 2])
+def test_first_derivatives_of_curvatures(method):
+    assert_differentiable(method, 2, lambda *rays: rays, -1.1, [[-3.0, 2.2, 2.9]], [[1.5, 0.1, -0.1]])
+
+
+def assert_differentiable(method: str, order: int, rays, *numbers) -> None:
+    """What is known at a hit, in two samples near it, the level and what rays are made of; below order 2 twice."""
+    samples, at = ball(6) / 4 + 0.3 * noise(6, 6, 6), (torch.tensor([2, 3]), torch.tensor([2, 3]), torch.arange(2))
+    given = [torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in numbers]
+
+    def seen(values, level, *rest):
+        field = fl.reconstruct(samples.index_put(at, values), method)
+        surface, (origins, directions) = LevelSet(field, level), rays(*rest)
         hit = surface.hit(origins, directions)
-        at = surface.at(origins, directions, hit)
-        return hit.t, at.point, at.normal
+        found = surface.at(origins, directions, hit, order)
+        return (hit.t, found.point, found.normal) if order == 1 else (found.curvatures,)
 
-    amount = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    given = (amount, level, origins, directions)
-    assert bool(seen(*given)[0].isfinite().all())
-    assert torch.autograd.gradcheck(seen, given)
-    if method in ("ncrsi", "triquadratic"):  # the others differ in nothing that second derivatives are made of
-        assert torch.autograd.gradgradcheck(lambda *a: laws.mixed(*seen(*a)), given, fast_mode=True)
-
-
-def test_curvature_is_differentiable():
-    samples = (ball(8) / 4 + 0.3 * noise(8, 8, 8)).requires_grad_()
-    ray = torch.tensor([[-3.0, 3.2, 3.9]]).double(), torch.tensor([[1.5, 0.1, -0.1]]).double()
-
-    def curvatures(amount):
-        surface = LevelSet(fl.reconstruct(samples.detach() * amount, "tricubic", scheme="direct"), -1.1)
-        return surface.at(*ray, surface.hit(*ray), 2).curvatures
-
-    assert torch.autograd.gradcheck(curvatures, torch.ones((), dtype=torch.float64, requires_grad=True))
+    inputs = (samples[at].clone().requires_grad_(), *given)
+    assert bool(seen(*inputs)[0].isfinite().all())
+    slopes = torch.autograd.grad(laws.mixed(*seen(*inputs)), inputs)
+    assert all(float(slope.abs().max()) > 1e-4 for slope in slopes)  # a test of zeros would be none
+    assert torch.autograd.gradcheck(seen, inputs)
+    if order == 1:
+        assert torch.autograd.gradgradcheck(lambda *a: laws.mixed(*seen(*a)), inputs, fast_mode=True)
 
 
 def test_derivatives_change_no_bit():

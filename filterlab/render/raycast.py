@@ -72,9 +72,10 @@ class Casting:
         return torch.cat([parts[name]() for name in channels], -1)
 
     def eye(self, seen: PixelRays, channels: Sequence[str]) -> Eye:
-        """The same, for finding edges in those channels: hits in float64, without derivatives."""
-        counting = replace(self, sheets=COUNTED, dtype=torch.float64)
-        radiance = lambda o, d: self(o, d, channels)  # noqa: E731
+        """The same, for finding edges in those channels; in float64, or both sides of one would be the same ray."""
+        exact = replace(self, dtype=torch.float64)
+        counting = replace(exact, sheets=COUNTED)
+        radiance = lambda o, d: exact(o, d, channels)  # noqa: E731
         return Eye(self.surface, self.region, seen.rays, lambda inside: counting._hits(inside).t, radiance)
 
     def _hits(self, inside: Spans) -> Hits:
@@ -194,7 +195,7 @@ def raycast(
         shadows,
         dtype,
     )
-    at_once = max(sheets, silhouettes.lines if silhouettes else 1)
+    at_once = max(sheets, silhouettes.lines * silhouettes.parts if silhouettes else 1)
     canvas = Canvas(seen, None, torch.is_grad_enabled(), sum(CHANNELS[name] for name in asked))
     with reporting(progress, seen.count) as report:
 
@@ -227,7 +228,7 @@ def _mean(
     mean = total / subpixels**2
     if silhouettes is None or not torch.is_grad_enabled():
         return mean
-    return mean + swept(silhouettes, cast.eye(seen, asked), pixels, seed)
+    return mean + swept(silhouettes, cast.eye(seen, asked), pixels, seed).to(mean)
 
 
 def _places(pixels: Tensor, subpixels: int, seed: int) -> Iterator[Place]:

@@ -10,6 +10,9 @@ beside what the hits' own derivatives give. Points of edges are found on lines t
 counted with the inverse of how often such lines meet them there: ½ (|m_u| + |m_v|) / |∇m| for each unit of length, so
 that a line that touches an edge counts no more than another.
 
+A line is cut into parts, and these are cut on where rays at both ends have other hits: another number of them, or one
+elsewhere among as many, since there an edge takes what the next one gives, as where one lump covers another.
+
 What m is says the ray on the edge. With F = 0 the surface (`surfaces.base`), o + t d the ray:
 
 | edge | m |
@@ -24,9 +27,8 @@ needs a distance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -41,6 +43,7 @@ COUNTED = 64
 """Hits of a ray that are told apart: edges behind the last are not seen."""
 
 _CUT, _ROUNDS = 8, 10  # parts that what an edge lies in is cut into, and how often: L is that of 8⁻¹⁰ of it away
+_APART, _STEEP = 0.125, 1  # voxels, and times how far rays are apart, by which hits differ if there is an edge between
 _AT_FACE = 1e-4  # of the domain's diagonal: a hit that vanishes farther from a face is none that left through it
 _STREAM = 1 << 48  # numbers from here on are drawn for lines, those below for subpixels
 
@@ -52,7 +55,7 @@ class Silhouettes:
     Attributes:
         lines: through every pixel, each across or down at a place that is drawn; more of them make derivatives less
             noisy, and change nothing of what is expected.
-        parts: of each line, between whose ends hits are counted: what comes and goes again within one is not seen.
+        parts: of each line, at whose ends hits are compared: what comes and goes again within one is not seen.
 
     Raises:
         ValueError: not two integers from 1 to 64.
@@ -93,9 +96,12 @@ class Eye:
         """Their hits (Q, `COUNTED`)."""
         return self.hits(self.spans(lines, x))
 
-    def count(self, lines: _Lines, x: Tensor) -> Tensor:
-        """How many, (Q,)."""
-        return (self.sheets(lines, x) < torch.inf).sum(-1)
+    def apart(self, stretches: _Stretches) -> Tensor:
+        """How far from each other (Q,) rays at both ends of stretches pass the middle of the domain."""
+        rays = [self.rays(stretches.lines.pixel, stretches.lines.place(x)) for x in stretches[1:3]]
+        (o, d), other = ([x.detach() for x in pair] for pair in rays)
+        middle = dot(o.new_tensor(self.surface.domain.center) - o, d)[:, None]
+        return (o - other[0] + middle * (d - other[1])).norm(dim=-1)
 
 
 class _Lines(NamedTuple):
@@ -113,9 +119,10 @@ class _Lines(NamedTuple):
 
     @classmethod
     def drawn(cls, pixels: Tensor, lines: int, seed: int) -> _Lines:
-        """So many through every pixel: a coin says which way the first goes, and the others take turns."""
+        """So many through every pixel, by turns across and down, first as a coin says; those of a way in stripes."""
         draw = lambda stream: jitter(seed, _STREAM + pixels * (lines + 1) + stream)  # noqa: E731
-        coin, beside = draw(lines) < 0.5, torch.stack([draw(k) for k in range(lines)])
+        coin = draw(lines) < 0.5
+        beside = torch.stack([(k // 2 + draw(k)) / ((lines + 1 - k % 2) // 2) for k in range(lines)])
         across = torch.stack([coin ^ bool(k % 2) for k in range(lines)])
         row = torch.arange(len(pixels), device=pixels.device)
         return cls(pixels.repeat(lines), row.repeat(lines), across.flatten(), beside.flatten())
@@ -126,6 +133,24 @@ class _Lines(NamedTuple):
     def place(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(u, v) of x along the lines."""
         return torch.where(self.across, x, self.beside), torch.where(self.across, self.beside, x)
+
+
+class _Stretches(NamedTuple):
+    """Parts of lines.
+
+    Attributes:
+        low, high: (Q,) x of their ends.
+        before, behind: (Q, `COUNTED`) hits there.
+    """
+
+    lines: _Lines
+    low: Tensor
+    high: Tensor
+    before: Tensor
+    behind: Tensor
+
+    def some(self, which: Tensor) -> _Stretches:
+        return _Stretches(self.lines.some(which), *(field[which] for field in self[1:]))
 
 
 class _Edges(NamedTuple):
@@ -164,43 +189,44 @@ def swept(how: Silhouettes, eye: Eye, pixels: Tensor, seed: int) -> Tensor:
 
 
 def _found(eye: Eye, lines: _Lines, parts: int) -> _Edges:
-    low, high, which = (torch.cat(column) for column in zip(*_brackets(eye, lines, parts), strict=True))
-    lines = lines.some(which)
-    low, high = _narrowed(eye, lines, low, high)
-    return _classified(eye, lines, low, high)
+    """In parts of lines, those are cut on at whose ends hits are others, until but edges are left."""
+    ends = [torch.full_like(lines.beside, x) for x in (0.0, 1.0)]
+    stretches = _cut(eye, _Stretches(lines, *ends, *(eye.sheets(lines, x) for x in ends)), parts)
+    for _ in range(_ROUNDS):
+        stretches = _cut(eye, stretches, _CUT)
+    return _classified(eye, stretches.some(_count(stretches.before) != _count(stretches.behind)))
 
 
-def _brackets(eye: Eye, lines: _Lines, parts: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """The ends (Q,) of parts of lines with other numbers of hits, and which lines."""
-    ends = [torch.full_like(lines.beside, k / parts) for k in range(parts + 1)]
-    before = eye.count(lines, ends[0])
-    for low, high in pairwise(ends):
-        behind = eye.count(lines, high)
-        which = (before != behind).nonzero()[:, 0]
-        yield low[which], high[which], which
-        before = behind
+def _cut(eye: Eye, stretches: _Stretches, parts: int) -> _Stretches:
+    """Of so many equal parts of each those at whose ends hits are others."""
+    lines, low, high, before, behind = stretches
+    inner = torch.arange(1, parts, dtype=low.dtype, device=low.device) / parts
+    each = torch.arange(len(low), device=low.device).repeat_interleave(parts - 1)
+    between = torch.lerp(low[:, None], high[:, None], inner)
+    hits = eye.sheets(lines.some(each), between.flatten()).view(len(low), parts - 1, COUNTED)
+    x, hits = (
+        torch.cat(row, 1) for row in ((low[:, None], between, high[:, None]), (before[:, None], hits, behind[:, None]))
+    )
+    slack = torch.clamp(_STEEP * eye.apart(stretches) / parts, min=_APART * eye.surface.domain.voxel_size)
+    row, part = _differ(hits[:, :-1], hits[:, 1:], slack[:, None]).nonzero().unbind(-1)
+    return _Stretches(lines.some(row), x[row, part], x[row, part + 1], hits[row, part], hits[row, part + 1])
 
 
-def _narrowed(eye: Eye, lines: _Lines, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Both, as near each other as cutting what lies between into ever smaller parts brings them."""
-    count, each = eye.count(lines, low), torch.arange(len(low), device=low.device)
-    inner = torch.arange(1, _CUT, dtype=low.dtype, device=low.device) / _CUT
-    several = lines.some(each.repeat_interleave(_CUT - 1))
-    for _ in range(_ROUNDS if len(low) else 0):
-        between = torch.lerp(low[:, None], high[:, None], inner)
-        same = eye.count(several, between.flatten()).view_as(between) == count[:, None]
-        before = same.long().cumprod(1).sum(1)  # how many, from low on, have as many hits as low
-        ends = torch.cat((low[:, None], between, high[:, None]), 1)
-        low, high = ends[each, before], ends[each, before + 1]
-    return low, high
+def _differ(before: Tensor, behind: Tensor, slack: Tensor) -> Tensor:
+    """Whether rays with these hits (..., S) differ in their number, or in one by more than some slack (...)."""
+    return torch.where(before == behind, 0, (before - behind).abs()).amax(-1) > slack
 
 
-def _classified(eye: Eye, lines: _Lines, low: Tensor, high: Tensor) -> _Edges:
+def _count(t: Tensor) -> Tensor:
+    return (t < torch.inf).sum(-1)
+
+
+def _classified(eye: Eye, stretches: _Stretches) -> _Edges:
     """What vanishes there; without what neither folds nor leaves through a face, as at holes."""
-    before, behind = eye.sheets(lines, low), eye.sheets(lines, high)
-    falls = ((before < torch.inf).sum(-1) > (behind < torch.inf).sum(-1))[:, None]
-    more, fewer = torch.where(falls, before, behind), torch.where(falls, behind, before)
-    rich = torch.where(falls[:, 0], low, high)
+    lines, low, high, before, behind = stretches
+    falls = _count(before) > _count(behind)
+    more, fewer = (torch.where(falls[:, None], *pair) for pair in ((before, behind), (behind, before)))
+    rich = torch.where(falls, low, high)
     first, fold = _vanishing(more, fewer)
     t = more.gather(1, torch.stack((first, first + fold.long()), 1).clamp(max=COUNTED - 1))
     length = eye.spans(lines, rich).length
@@ -216,7 +242,7 @@ def _vanishing(more: Tensor, fewer: Tensor) -> tuple[Tensor, Tensor]:
     Those whose removal makes both rows most alike: Σ_{j<i} |t_j − t'_j| + Σ_{j≥i} |t_{j+a} − t'_j| is least, of a hits
     removed from i on.
     """
-    count, left = ((t < torch.inf).sum(-1) for t in (more, fewer))
+    count, left = _count(more), _count(fewer)
     fold = (count - left) % 2 == 0
     place = torch.arange(more.shape[1], device=more.device)
     later = more.gather(1, (place + 1 + fold.long()[:, None]).clamp(max=more.shape[1] - 1))
