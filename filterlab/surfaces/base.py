@@ -201,10 +201,8 @@ class Surface(ABC):
         if not len(index) or not self._follows(*_chosen(index[:1], t.shape, origins, directions, t[..., None])):
             return t
         o, d, own = _chosen(index, t.shape, origins, directions, t[..., None])
-        if tensors is None:
-            own = self._stepped(o, d, own[:, 0])
-        else:
-            own = _Attached.apply(self, own[:, 0], o, d, *tensors)
+        own = own[:, 0]
+        own = self._stepped(o, d, own) if tensors is None else _Attached.apply(self, own, o, d, *tensors)
         return t.flatten().index_copy(0, index, own).reshape(t.shape)
 
     def _follows(self, origins: Tensor, directions: Tensor, t: Tensor) -> bool:
