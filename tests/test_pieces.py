@@ -225,6 +225,18 @@ def test_no_piece_that_may_hold_the_level_is_left_out(method):
     assert len(field.pieces_along(origins, directions, 99).ray) == 0
 
 
+@pytest.mark.parametrize("edge", [1, 2, 4])
+def test_bounds_do_not_depend_on_what_is_summed_at_once(edge, monkeypatch):
+    lattice = fl.reconstruct(samples(9, 7, 6), "triquadratic").lattice
+    found = []
+    for at_once in (1, 8, 1000):
+        monkeypatch.setattr(bounds, "_cells_at_once", lambda lattice, at_once=at_once: at_once)
+        low, high = zip(*bounds.layers_of(lattice, edge), strict=True)
+        found.append(torch.stack((torch.cat(low), torch.cat(high))))
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
+
+
 @pytest.mark.parametrize("edge", [1, 3, 4])
 @pytest.mark.parametrize("name", ["linear", "bspline0", "bspline2", "bspline3", "catmull-rom", "notch"])
 def test_bounds_are_the_hulls_of_the_cells(name, edge):

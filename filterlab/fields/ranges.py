@@ -30,6 +30,8 @@ _MANY = 1 << 25  # cells from which on bricks have edges of 4, not 2
 _AT_ONCE = 8
 """Cells along z whose taps are summed together. Measured (128³, one core): 2 take 1.1 to 2 times as long (trilinear,
 tricubic: taps are read again), 32 up to 2.8 times (they leave the cache)."""
+_NUMBERS_AT_ONCE = 1 << 24
+"""The same on a GPU, in coefficients: there a small operation costs as much as one of millions of numbers."""
 _ROUNDING = 64  # units of rounding that a sum of taps may lose, relative to Σ |w| · max |c|
 
 
@@ -123,7 +125,7 @@ def _norm(lattice: Lattice) -> float:
 def layers_of(lattice: Lattice, edge: int) -> Iterator[tuple[Tensor, Tensor]]:
     """(low, high) of a few layers of bricks after the others, (…, by, bx) each: no more than these are in memory."""
     values, (_, _, sz), (_, _, depth) = lattice.coefficients.detach(), lattice.supports, lattice.cells
-    step = max(_AT_ONCE // edge, 1) * edge
+    step = max(_cells_at_once(lattice) // edge, 1) * edge
     for first in range(0, depth, step):
         cells = min(step, depth - first)
         slab = values.narrow(0, first, cells + sz - 1).double()
@@ -133,6 +135,13 @@ def layers_of(lattice: Lattice, edge: int) -> Iterator[tuple[Tensor, Tensor]]:
             low, high = (_windows(x, dim, own * edge, int(lattice.continuous)) for x in (low, high))
             low, high = low.amin(-1), high.amax(-1)
         yield low, high
+
+
+def _cells_at_once(lattice: Lattice) -> int:
+    if lattice.coefficients.device.type == "cpu":
+        return _AT_ONCE
+    a_layer = math.prod(n * own for n, own in zip(lattice.cells, _columns(lattice), strict=True)) // lattice.cells[2]
+    return max(_AT_ONCE, _NUMBERS_AT_ONCE // a_layer)
 
 
 def straddling(lattice: Lattice, level: float) -> int:
