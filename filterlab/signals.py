@@ -256,7 +256,7 @@ def marschner_lobb(frequency: float = 6.0, alpha: float = 0.25, voxel_size: floa
     scale, fastest = 1 / (2 * (1 + alpha)), math.pi**2 * frequency
     bounds = Bounds(
         scale * math.hypot(alpha * fastest, math.pi / 2),
-        scale * max(alpha * (fastest**2 + math.pi / 2 * fastest), (math.pi / 2) ** 2),
+        scale * max(alpha * (fastest * fastest + math.pi / 2 * fastest), (math.pi / 2) ** 2),
     )
     return Signal("marschner-lobb", function, voxel_size=voxel_size, bounds=bounds)
 
@@ -409,7 +409,7 @@ def gaussian(sigma: float = 0.3, center: Corner = (0.0, 0.0, 0.0), voxel_size: f
         value = torch.exp(-(d * d).sum(-1) / (2 * sigma * sigma))
         return value, -value[..., None] * d / (sigma * sigma)
 
-    bounds = Bounds(math.exp(-0.5) / sigma, 1 / sigma**2)
+    bounds = Bounds(math.exp(-0.5) / sigma, (1 / sigma) * (1 / sigma))
     return Signal("gaussian", function, voxel_size=voxel_size, bounds=bounds)
 
 
@@ -422,7 +422,7 @@ def plane_wave(wave_vector: Corner = (4.0, 2.0, 1.0), phase: float = 0.0, voxel_
         return torch.cos(angle), -torch.sin(angle)[..., None] * k
 
     longest = math.hypot(*wave_vector)
-    return Signal("plane-wave", function, voxel_size=voxel_size, bounds=Bounds(longest, longest**2))
+    return Signal("plane-wave", function, voxel_size=voxel_size, bounds=Bounds(longest, longest * longest))
 
 
 SIGNALS: dict[str, Callable[..., Signal]] = {
