@@ -280,7 +280,8 @@ def check_points(points: Tensor, channels: tuple[int, int] | None) -> Tensor:
     """The points in their compute type, promote(points, float32). Raises on a wrong type or shape."""
     if not isinstance(points, Tensor):
         raise TypeError(f"points must be a torch.Tensor; got {type(points).__name__}")
-    if points.dtype not in _COMPUTED and (points.dtype.is_complex or points.dtype == torch.bool):
+    computed = points.dtype in _COMPUTED
+    if not computed and (points.dtype.is_complex or points.dtype == torch.bool):
         raise TypeError(f"points must be real numbers; got {points.dtype}")
     if points.ndim == 0 or points.shape[-1] != 3:
         raise ValueError(f"points must have shape (..., 3) in x, y, z order; got {tuple(points.shape)}")
@@ -288,7 +289,7 @@ def check_points(points: Tensor, channels: tuple[int, int] | None) -> Tensor:
         raise ValueError(
             f"a batched field needs points of shape (N, ..., 3), N = {channels[0]} or 1; got {tuple(points.shape)}"
         )
-    if points.dtype in _COMPUTED:  # asked first: to find the type and convert to it takes microseconds to do nothing
+    if computed:  # asked first: to find the type and convert to it takes microseconds to do nothing
         return points
     return points.to(torch.promote_types(points.dtype, torch.float32))
 

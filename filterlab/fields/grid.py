@@ -341,11 +341,12 @@ class GridField(Field):
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         check_order(order, self.max_order)
         points = check_points(points, self.channels)
-        shape = points.shape[:-1] if self.channels is None else points.shape[1:-1]
-        flat = points.reshape(1 if self.channels is None else points.shape[0], math.prod(shape), 3)
-        evaluations = self._own if self.channels is None or len(flat) == self.channels[0] else self._shared
+        if self.channels is None:
+            axis, shape, flat, evaluations = 0, points.shape[:-1], points.reshape(1, -1, 3), self._own
+        else:
+            axis, shape, flat = 2, points.shape[1:-1], points.reshape(points.shape[0], -1, 3)
+            evaluations = self._own if len(flat) == self.channels[0] else self._shared
         rows, sign = evaluations[order](flat)
-        axis = 0 if self.channels is None else 2
         value, *others = self._decoded(rows, shape).split_with_sizes(_ROWS[: order + 1], axis)
         if sign is not None:
             sign = sign.reshape((*(len(flat), 1)[:axis], *shape, 3))  # over channels
