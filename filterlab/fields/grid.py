@@ -344,7 +344,8 @@ class GridField(Field):
         if self.channels is None:
             axis, shape, flat, evaluations = 0, points.shape[:-1], points.reshape(1, -1, 3), self._own
         else:
-            axis, shape, flat = 2, points.shape[1:-1], points.reshape(points.shape[0], -1, 3)
+            axis, shape = 2, points.shape[1:-1]
+            flat = points.reshape(points.shape[0], math.prod(shape), 3)
             evaluations = self._own if len(flat) == self.channels[0] else self._shared
         rows, sign = evaluations[order](flat)
         value, *others = self._decoded(rows, shape).split_with_sizes(_ROWS[: order + 1], axis)
