@@ -31,11 +31,11 @@ class Evaluator:
 
     def __call__(self, points: Tensor) -> Placed:
         """(N, M, 3) -> rows (N, C, J, M), and sign (N, M, 3) or None."""
-        gather = self.gather
-        if sorting_may_pay(points, gather.bytes_of_channel):
+        gather, (entries, count, _) = self.gather, points.shape
+        if sorting_may_pay(count, gather.bytes_of_channel):
             return self._in_steps(points)
-        out = gather.fresh(points)
-        if out.numel() == 0:
+        out = fresh((entries, gather.channels, gather.rows, count), gather.dtype)
+        if not (entries and count and gather.channels):
             return out, None
         jobs = self.program.shared(gather.coefficients, readable(points, 1), out)
         pool.run(self.program.run, jobs)

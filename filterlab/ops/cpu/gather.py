@@ -140,12 +140,12 @@ def _arranged(ordered: Sorted, cotangents: Tensor) -> Tensor:
 
 def _sorting_pays(points: Tensor, bytes_of_channel: int) -> bool:
     """Whether sorting points (N, M, 3) costs less than it saves (`order`)."""
-    return sorting_may_pay(points, bytes_of_channel) and order.scattered(points)
+    return sorting_may_pay(points.shape[1], bytes_of_channel) and order.scattered(points)
 
 
-def sorting_may_pay(points: Tensor, bytes_of_channel: int) -> bool:
-    """Whether it is worth looking at located points."""
-    return points.shape[1] >= FEWEST_SORTED and bytes_of_channel >= SMALLEST_SORTED_IN
+def sorting_may_pay(count: int, bytes_of_channel: int) -> bool:
+    """Whether it is worth looking at so many located points."""
+    return count >= FEWEST_SORTED and bytes_of_channel >= SMALLEST_SORTED_IN
 
 
 def _in_order(points: Tensor, shape: Sequence[int], start: int) -> Iterator[tuple[int, slice, Sorted]]:
