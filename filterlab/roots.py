@@ -35,7 +35,7 @@ import torch
 from torch import Tensor
 
 MAX_DEGREE = 9
-_ROUNDINGS = 3  # τ = 3 n ε: in float32 the halves of some clusters of nine roots were wrong by 2.8 n ε p̃
+ROUNDINGS = 3  # τ = 3 n ε: in float32 the halves of some clusters of nine roots were wrong by 2.8 n ε p̃
 _CHUNK = {"cpu": 2**16}  # polynomials at a time: enough to pay for the calls, few enough to stay in the caches
 _LEVELS = 64  # halvings of [0, 1]; what is left then is narrower than floats can tell
 _PASSES = 200  # of Newton's method and bisection
@@ -178,7 +178,7 @@ def _basis(t: Tensor, n: int) -> Tensor:
 
 def _tolerance(n: int, dtype: torch.dtype) -> float:
     """τ."""
-    return _ROUNDINGS * n * torch.finfo(dtype).eps
+    return ROUNDINGS * n * torch.finfo(dtype).eps
 
 
 # --- batches ----------------------------------------------------------------------------------------------------------

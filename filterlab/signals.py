@@ -15,10 +15,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from filterlab.fields.base import Domain, Field, check_order, check_points
-from filterlab.fields.crossings import RAYS_AT_ONCE, Along, Bounds, crossings, stepped
+from filterlab.fields.base import Domain, Field, check_order, check_points, type_of_rays
+from filterlab.fields.crossings import Along, Bounds, crossings, stepped
 from filterlab.ops.pieces import Pieces
-from filterlab.ops.raycast import Candidates, joined
+from filterlab.ops.raycast import Candidates
+from filterlab.ops.reference import raycast
 from filterlab.ops.reference.pieces import inside
 from filterlab.volume import Geometry, Volume
 
@@ -99,27 +100,22 @@ class Signal(Field):
         places, matrix = (torch.tensor(x, device=origins.device, dtype=torch.float64) for x in _interpolation(n))
         t = lines.far[:, None] * places
         values = self(lines.origins[:, None] + t[..., None] * lines.directions[:, None])
-        dtype = torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
-        return Pieces(ray, lines.near, lines.far, (values @ matrix.T).to(dtype), start)
+        coefficients = (values.detach() @ matrix.T).to(type_of_rays(origins, directions))
+        return Pieces(ray, lines.near, lines.far, coefficients, start)
 
     def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
         if self._degree is not None:
             return super().first_crossing(origins, directions, level)
-        t = torch.full((len(origins),), math.inf, dtype=torch.float64, device=origins.device)
-        for part in _parts(len(origins)):
-            found = self._crossings(origins[part], directions[part], level, first=True)
-            t[part] = t[part].scatter_reduce(0, found.ray, found.start + found.near, "amin")
-        return t
+        return raycast.first_of(self._crossings_at(level, first=True), origins, directions, _INTERVALS)
 
     def crossing_candidates(self, origins: Tensor, directions: Tensor, level: float) -> Candidates:
         """Each crossing that is no root of a piece, as a piece of no length that begins with its root."""
         if self._degree is not None:
             return super().crossing_candidates(origins, directions, level)
-        found = []
-        for part in _parts(len(origins)):
-            own = self._crossings(origins[part], directions[part], level, first=False)
-            found.append(own._replace(ray=own.ray + part.start))
-        return joined(found)
+        return raycast.all_of(self._crossings_at(level, first=False), origins, directions, _INTERVALS)
+
+    def _crossings_at(self, level: float, first: bool) -> raycast.Search:
+        return lambda origins, directions: self._crossings(origins, directions, level, first)
 
     def _crossings(self, origins: Tensor, directions: Tensor, level: float, first: bool) -> Candidates:
         lines, met, start = inside(origins.double(), directions.double(), self.domain.lower, self.domain.upper)
@@ -186,8 +182,7 @@ class Signal(Field):
         return Volume(torch.stack(planes), spacing=spacing, origin=origin)
 
 
-def _parts(rays: int) -> list[slice]:
-    return [slice(first, first + RAYS_AT_ONCE) for first in range(0, rays, RAYS_AT_ONCE)] or [slice(0, 0)]
+_INTERVALS = 125  # that a ray has at a time, about
 
 
 @lru_cache

@@ -22,8 +22,8 @@ from benchmarks.settings import Settings
 from filterlab.methods import METHODS, reconstruct
 from filterlab.surfaces import LevelSet
 
-LEVEL = 0.5
-LEVELS = (0.48, 0.49, 0.5, 0.51, 0.52)
+_LEVEL = 0.5
+_LEVELS = (0.48, 0.49, 0.5, 0.51, 0.52)
 _BARS = {"trilinear": at_most("0.25"), "triquadratic": at_most("0.45"), "tricubic": at_most("0.9")}
 _PROCESSES = 3  # of which the peak memory is taken
 _PLAIN = 64  # pixels along an edge of what plain torch casts
@@ -34,7 +34,7 @@ def task_of(settings: Settings, size: int | None = None, voxels: int | None = No
     origins, directions = scene.camera.rays(scene.size, scene.size)
     origins, directions = (x.expand(directions.shape).reshape(-1, 3).float() for x in (origins, directions))
     volume, origins, directions = (x.contiguous().to(device) for x in (scene.volume, origins, directions))
-    return Casting(volume, LEVEL, origins, directions, settings.threads)
+    return Casting(volume, _LEVEL, origins, directions, settings.threads)
 
 
 def described(task: Casting) -> str:
@@ -82,7 +82,7 @@ def _new_level(settings: Settings) -> Race:
     """Another level in every call: nothing that was found out for one serves the next."""
     task = task_of(settings)
     field = reconstruct(task.volume, "triquadratic")
-    levels = cycle(LEVELS)
+    levels = cycle(_LEVELS)
 
     call = lambda: hits_and_normals(LevelSet(field, next(levels)), task)  # noqa: E731
     contestants, absent, bars = [Contestant("triquadratic", call, samples=len(task.origins))], {}, {embree_mesh: "1/3"}
@@ -91,7 +91,7 @@ def _new_level(settings: Settings) -> Race:
         if why := peer.missing():
             absent[peer.NAME] = why
             continue
-        other = cycle(LEVELS)
+        other = cycle(_LEVELS)
         contestants.append(peer.new_level(task, partial(next, other)))
         ratios.append(Ratio("triquadratic", contestants[-1].name, at_most(bars[peer]) if peer in bars else None))
     what = f"{described(task)}: from a new level to hits (and normals)"

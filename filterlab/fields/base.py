@@ -294,6 +294,11 @@ def check_points(points: Tensor, channels: tuple[int, int] | None) -> Tensor:
     return points.to(torch.promote_types(points.dtype, torch.float32))
 
 
+def type_of_rays(origins: Tensor, directions: Tensor) -> torch.dtype:
+    """What rays are computed in: promote(origins, directions, float32)."""
+    return torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
+
+
 def check_order(order: int, max_order: int) -> None:
     """Raises ValueError unless 0 ≤ order ≤ max_order."""
     if not isinstance(order, int) or not 0 <= order <= max_order:

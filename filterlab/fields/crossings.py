@@ -22,7 +22,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-RAYS_AT_ONCE = 1 << 12
 _FINEST, _FINER = 2.0**-40, 2.0**-24  # resolution, of the way in the domain: where β is known, where it is not
 
 Along = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]

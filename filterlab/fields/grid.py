@@ -15,7 +15,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from filterlab.fields.base import Domain, Field, Relevant, check_order, check_points
+from filterlab.fields.base import Domain, Field, Relevant, check_order, check_points, type_of_rays
 from filterlab.fields.ranges import ranges, straddling
 from filterlab.fields.storage import Quantization, stored_as
 from filterlab.kernels import Factor, Kernel, PiecewisePolynomial
@@ -301,7 +301,7 @@ class GridField(Field):
 
     def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
         self._check_pieces()
-        dtype = _type_of_rays(origins, directions)
+        dtype = type_of_rays(origins, directions)
         lattice = self.lattice
         rays = in_cells(origins, directions, self.domain.geometry, lattice)
         if level is None or not lattice.continuous:  # a jump may lie between bricks that hold no level
@@ -317,7 +317,7 @@ class GridField(Field):
 
     def _raycast(self, level: float, origins: Tensor, directions: Tensor) -> Raycast:
         self._check_pieces()
-        dtype = _type_of_rays(origins, directions)
+        dtype = type_of_rays(origins, directions)
         lattice = self.lattice
         bounds = ranges(lattice)
         return Raycast(lattice, self.domain.geometry, level, dtype, bounds.clear(level, dtype), bounds.edge)
@@ -370,10 +370,6 @@ class GridField(Field):
         if quantization is not None:
             rows = quantization.of_rows(rows.reshape(*(channels or (1, 1)), *rows.shape[2:]))
         return rows.reshape(*channels, count, *shape)
-
-
-def _type_of_rays(origins: Tensor, directions: Tensor) -> torch.dtype:
-    return torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
 
 
 _ROWS = (1, 3, 6)

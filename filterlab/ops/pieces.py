@@ -23,6 +23,8 @@ from filterlab.ops.stencil import Row, Stencil
 
 Triple = tuple[float, float, float]
 
+NO_MOTION = 1e-30  # of the largest component: over any distance that float64 resolves, such an axis stays put
+
 
 class Pieces(NamedTuple):
     """The pieces that rays pass, ray by ray, along each from near to far.

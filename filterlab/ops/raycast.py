@@ -21,6 +21,10 @@ from filterlab.volume import Geometry
 
 JUMP, REPEATED = 1, 2  # bits of `Written.flags`
 
+# of the programs' root search
+PASSES = 120  # of Newton's method and bisection
+USUAL = 2  # passes before a value that may be rounding decides anything
+
 _RADII = (1, 2, 3, 4, 5, 6, 7, 8)  # bricks around an empty one that are told to be empty as well
 _FEW = 4  # candidates of a ray at first; those with more are cast again
 _NUMBERS_AT_ONCE = 1 << 24  # of candidates

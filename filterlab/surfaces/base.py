@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.fields.base import Domain, check_order
+from filterlab.fields.base import Domain, check_order, type_of_rays
 from filterlab.ops.differentiable.recording import transforming
 
 MAX_SHEETS = 4096
@@ -310,7 +310,7 @@ def _broadcast(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
             raise TypeError(f"{name} must be a floating-point torch.Tensor; got {found}")
         if x.ndim == 0 or x.shape[-1] != 3:
             raise ValueError(f"{name} must have shape (..., 3) in x, y, z order; got {tuple(x.shape)}")
-    dtype = torch.promote_types(torch.promote_types(origins.dtype, directions.dtype), torch.float32)
+    dtype = type_of_rays(origins, directions)
     try:
         origins, directions = torch.broadcast_tensors(origins.to(dtype), directions.to(dtype))
     except RuntimeError:

@@ -21,8 +21,8 @@ from llvmlite import ir
 
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import DOUBLE, I8, I32, I64, Lanes, Value, Variable
+from filterlab.ops.pieces import NO_MOTION
 
-_NO_MOTION = 1e-30  # of the largest component: over any distance that doubles resolve, such an axis stays put
 _EXPONENT = 0x7FF << 52
 _FLIP = 2046 << 52  # 2^(e − 1023) and 2^(1023 − e) have exponents that add up to this
 
@@ -77,7 +77,7 @@ class Walk:
         """
         e, b = self.lanes, self.builder
         origins, directions = self._in_cells(origins, directions)
-        most = e.multiply(self._largest(directions), e.constant(_NO_MOTION))
+        most = e.multiply(self._largest(directions), e.constant(NO_MOTION))
         still = [b.fcmp_ordered("<=", e.absolute(d), most) for d in directions]
         speed = [e.where(rests, e.constant(1), d) for rests, d in zip(still, directions, strict=True)]
         first, last = self._span(origins, speed, still)

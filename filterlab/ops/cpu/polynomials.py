@@ -23,10 +23,8 @@ from math import comb
 from llvmlite import ir
 
 from filterlab.ops.cpu.lanes import I8, Lanes, Value, Variable
-
-_ROUNDINGS = 3  # τ = 3 n ε
-_PASSES = 120  # of Newton's method and bisection
-_USUAL = 2  # passes before a value that may be rounding decides anything
+from filterlab.ops.raycast import PASSES, USUAL
+from filterlab.roots import ROUNDINGS
 
 Rows = list[Value]
 """Coefficients, packs."""
@@ -63,7 +61,7 @@ class FirstRoot:
     def __init__(self, lanes: Lanes, degree: int) -> None:
         self.lanes, self.builder, self.degree = lanes, lanes.builder, degree
         self.eps = 2.0**-23 if lanes.bits == 32 else 2.0**-52
-        self.tolerance = _ROUNDINGS * degree * self.eps
+        self.tolerance = ROUNDINGS * degree * self.eps
 
     # --- signs ---
 
@@ -185,14 +183,14 @@ class FirstRoot:
         u = e.variable(e.maximum(e.minimum(part, e.constant(0.98)), e.constant(0.02)))
         last, active = e.variable(e.constant(1)), e.variable(mask)
         k = e.variable(I8(0))
-        going = lambda: b.and_(e.any(active.value), b.icmp_unsigned("<", k.value, I8(_PASSES)))  # noqa: E731
+        going = lambda: b.and_(e.any(active.value), b.icmp_unsigned("<", k.value, I8(PASSES)))  # noqa: E731
         with e.repeat_while(going):
             at = u.value
             value, slope = self._horner([r.all(e.count) for r in rows_], at)
             size = self._plain_horner([r.all(e.count) for r in sizes], at)
             noise = e.multiply(size, e.constant(0.5 * len(rows) * self.eps))
             clear = b.fcmp_ordered(">", e.absolute(value), noise)
-            late = e.everywhere(b.icmp_unsigned(">=", k.value, I8(_USUAL)))
+            late = e.everywhere(b.icmp_unsigned(">=", k.value, I8(USUAL)))
             arrived = b.and_(late, b.and_(b.not_(clear), b.fcmp_ordered("<", slope, zero)))
             positive = b.select(clear, b.fcmp_ordered(">", value, zero), b.fcmp_ordered("<", at, half))
             low.value, high.value = e.where(positive, at, low.value), e.where(positive, high.value, at)

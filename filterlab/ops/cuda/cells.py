@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager
 
 from filterlab.ops.cuda.source import Source, number
 from filterlab.ops.cuda.taps import AXES
+from filterlab.ops.pieces import NO_MOTION
 
 BLOCK = 32  # rays of a program; a warp
 
@@ -21,7 +22,6 @@ NUMBERS = (*(f"{name}_{axis}" for name in _TRIPLES for axis in AXES), *_MATRIX, 
 SIZES = ("rays", *(f"{name}_{axis}" for name in ("cells", "bricks") for axis in AXES), "edge")
 ARRAYS = ("origins", "directions", "clear", "numbers")
 
-_NO_MOTION = 1e-30  # of the largest component: over any distance that doubles resolve, such an axis stays put
 _EXPONENT = 0x7FF << 52
 _FLIP = 2046 << 52  # 2^(e − 1023) and 2^(1023 − e) have exponents that add up to this
 
@@ -97,7 +97,7 @@ class Walk:
             line(f"speed_{a} = speed_{a} * scale")
         self._longest()
         for a in AXES:
-            line(f"still_{a} = tl.abs(speed_{a}) <= longest * {number(_NO_MOTION)}")
+            line(f"still_{a} = tl.abs(speed_{a}) <= longest * {number(NO_MOTION)}")
             line(f"speed_{a} = tl.where(still_{a}, 1.0, speed_{a})")
 
     def _longest(self) -> None:

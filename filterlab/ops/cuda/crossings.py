@@ -103,7 +103,7 @@ class _Program:
     # --- pieces ---
 
     def _piece(self) -> None:
-        """`row_0` …, coefficients of f − level; `joined`, `jump`, `begins_before` and `holds`, masks."""
+        """`row_0` …, coefficients of f − level; `jump`, `repeated` and `holds`, masks."""
         line, rows = self.line, self.rows
         for end, at in (("u", "near"), ("v", "far")):
             for a in AXES:

@@ -12,10 +12,9 @@ from math import comb
 
 from filterlab.ops.cuda.cells import any_of
 from filterlab.ops.cuda.source import Source, number
+from filterlab.ops.raycast import PASSES, USUAL
+from filterlab.roots import ROUNDINGS
 
-_ROUNDINGS = 3  # τ = 3 n ε
-_PASSES = 120  # of Newton's method and bisection
-_USUAL = 2  # passes before a value that may be rounding decides anything
 EPS = {"float32": 2.0**-23, "float64": 2.0**-52}
 TINY = {"float32": 2.0**-126, "float64": 2.0**-1022}
 
@@ -31,7 +30,7 @@ class FirstRoot:
     def __init__(self, source: Source, degree: int, arithmetic: str) -> None:
         self.source, self.line, self.degree, self.arithmetic = source, source.line, degree, arithmetic
         self.eps = EPS[arithmetic]
-        self.tolerance = _ROUNDINGS * degree * self.eps
+        self.tolerance = ROUNDINGS * degree * self.eps
         self.indices = range(degree + 1)
 
     def names(self, of: str) -> list[str]:
@@ -154,11 +153,11 @@ class FirstRoot:
         line("last = nothing + 1.0")
         line(f"active = {mask}")
         line("k = 0")
-        with self._while("active", f"k < {_PASSES}"):
+        with self._while("active", f"k < {PASSES}"):
             self._horner(rows, "u")
             line(f"size = {self._plain_horner([f'tl.abs({row})' for row in rows], 'u')}")
             line(f"clear_ = tl.abs(value) > size * {number(0.5 * len(rows) * self.eps)}")
-            line(f"arrived = ~clear_ & (slope < 0.0) & (k >= {_USUAL})")
+            line(f"arrived = ~clear_ & (slope < 0.0) & (k >= {USUAL})")
             line("positive = tl.where(clear_, value > 0.0, u < 0.5)")
             line("bottom = tl.where(positive, u, bottom)")
             line("top = tl.where(positive, top, u)")

@@ -25,12 +25,11 @@ from torch import Tensor
 from filterlab import bernstein
 from filterlab.kernels import PiecewisePolynomial
 from filterlab.ops.gather import extent
-from filterlab.ops.pieces import Lattice, Pieces, Triple
+from filterlab.ops.pieces import NO_MOTION, Lattice, Pieces, Triple
 from filterlab.ops.stencil import Product
 from filterlab.volume import Geometry
 
 CHUNK = 1 << 13  # pieces restricted at a time: their taps stay in the cache
-_NO_MOTION = 1e-30  # of the largest component: over any distance that float64 resolves, such an axis stays put
 
 
 class Lines(NamedTuple):
@@ -69,7 +68,7 @@ def inside(origins: Tensor, directions: Tensor, lower: Triple, upper: Triple) ->
     Rays `(R, 3)` begin at their origins: nothing behind is seen. Of rays that miss the box there is no line.
     """
     low, high = origins.new_tensor(lower), origins.new_tensor(upper)
-    still = directions.abs() <= _NO_MOTION * directions.abs().amax(-1, keepdim=True)
+    still = directions.abs() <= NO_MOTION * directions.abs().amax(-1, keepdim=True)
     speed = torch.where(still, 1, directions)
     a, b = (low - origins) / speed, (high - origins) / speed
     within = (origins >= low) & (origins <= high)
