@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -11,6 +13,8 @@ from filterlab.fields.grid import GridField
 from filterlab.kernels import KERNELS
 from filterlab.methods import METHODS, from_kernel
 from filterlab.ops import cpu
+from filterlab.ops.cpu import machine
+from filterlab.ops.cpu import raycast as vector_code
 from filterlab.ops.differentiable import raycast
 from filterlab.ops.raycast import Raycast, clear_of
 
@@ -67,6 +71,27 @@ def test_the_same_hits_and_pieces(method, boundary):
 def test_every_kernel(name):
     """Those that jump as well: there every cell is looked into."""
     assert_alike(fl.reconstruct(samples(), from_kernel(KERNELS[name]), prefilter=False))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(16, 24), (2, 3, 8, 16), (15, 100), (7, 9), (33, 3), (1, 64), (64, 1), (2, 0, 8)])
+def test_rays_of_an_image_are_hit_as_each_alone(shape, dtype):
+    """In packs of two rows, with places left over at the ends; or of one row, where these would be many."""
+    field = fl.reconstruct(samples(), "triquadratic")
+    o, d = (x.reshape(*shape, 3) for x in rays(field, math.prod(shape), dtype))
+    given = described(field, dtype)
+    together, alone = (raycast.first(given, *x, "cpu") for x in ((o, d), (o.reshape(-1, 3), d.reshape(-1, 3))))
+    assert together.shape == shape
+    assert torch.equal(together.flatten(), alone)
+    assert math.prod(shape) == 0 or 0.2 < (alone < torch.inf).double().mean() < 1
+
+
+def test_images_are_cast_in_packs_of_two_rows():
+    lanes = machine.lanes_of(torch.float32)
+    packs = lambda *shape: vector_code._in_packs(torch.Size(shape), torch.float32)  # noqa: E731
+    assert packs(512, 512) == (512, 512, 512 * 512 // lanes, (lanes // 2).bit_length() - 1)
+    assert packs(33, 3) == (1, 99, -(-99 // lanes), lanes.bit_length() - 1)
+    assert packs(99) == packs(33, 3)
 
 
 @pytest.mark.parametrize("storage", ["float16", "bfloat16", "float32", "int16", "uint8"])

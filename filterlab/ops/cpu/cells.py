@@ -68,20 +68,15 @@ class Walk:
 
     # --- rays ---
 
-    def begin(self, real: Value, origins: Sequence[Value], directions: Sequence[Value]) -> None:
-        """Put a pack of rays where they enter the domain, all axes at once.
-
-        Args:
-            real: a mask: the others are not walked.
-            origins, directions: packs of x, y, z in the world, doubles.
-        """
+    def begin(self, origins: Sequence[Value], directions: Sequence[Value]) -> None:
+        """Put a pack of rays where they enter the domain, all axes at once: packs of x, y, z in the world, doubles."""
         e, b = self.lanes, self.builder
         origins, directions = self._in_cells(origins, directions)
         most = e.multiply(self._largest(directions), e.constant(NO_MOTION))
         still = [b.fcmp_ordered("<=", e.absolute(d), most) for d in directions]
         speed = [e.where(rests, e.constant(1), d) for rests, d in zip(still, directions, strict=True)]
         first, last = self._span(origins, speed, still)
-        self.going.value = met = b.and_(real, b.fcmp_ordered("<=", first, last))
+        self.going.value = met = b.fcmp_ordered("<=", first, last)
         self.start.value = first = e.where(met, first, e.constant(0))
         self._s.value, self._end.value = e.constant(0), e.where(met, e.subtract(last, first), e.constant(0))
         for i, (o, d, rests) in enumerate(zip(origins, speed, still, strict=True)):

@@ -18,11 +18,13 @@ from filterlab.ops.cpu.memory import ARITHMETIC, has_room
 from filterlab.ops.gather import STORAGE, in_whole_rows
 from filterlab.ops.raycast import Candidates, Raycast, Written, written_in_parts
 
+_WASTED = 17 / 16  # places for rays in packs of two rows, over rays: more would take back most of what is gained
+
 
 def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
-    """`ops.reference.raycast.first`, fused: t (R,) float64 of rays (R, 3), without derivatives."""
-    t = torch.empty(len(origins), dtype=torch.float64)
-    if len(t):
+    """`ops.reference.raycast.first`, fused: t (...) float64 of rays (..., 3), without derivatives."""
+    t = torch.empty(origins.shape[:-1], dtype=torch.float64)
+    if t.numel():
         _Cast(given, "first", origins, directions).run(t=t)
     return t
 
@@ -32,6 +34,8 @@ def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidate
 
     def write(rays: Tensor, capacity: int) -> Written:
         written = Written.room(given, len(rays), capacity)
+        if not len(rays):
+            return written
         cast = _Cast(given, "candidates", origins[rays], directions[rays])
         cast.job.capacity = capacity
         cast.run(**written._asdict())
@@ -44,19 +48,28 @@ class _Cast:
     """A lattice and rays as a job."""
 
     def __init__(self, given: Raycast, asked: str, origins: Tensor, directions: Tensor) -> None:
-        self.dtype, self.rays = given.dtype, len(origins)
         coefficients = in_whole_rows(given.lattice.coefficients)
         self.function = compiler.compiled(_variant(given, asked, coefficients))
         self.job = _job(given, coefficients)
-        self.job.rays = self.rays
+        self.job.rows, self.job.columns, self.job.packs, self.job.wide = _in_packs(origins.shape[:-1], given.dtype)
         self.job.point(origins=origins.to(given.dtype).contiguous(), directions=directions.to(given.dtype).contiguous())
 
     def run(self, **results: Tensor) -> None:
         job = self.job
         job.point(**results)
-        packs = -(-self.rays // lanes_of(self.dtype))
-        job.next, job.chunks = 0, -(-packs // PACKS_OF_A_CHUNK)
+        job.next, job.chunks = 0, -(-job.packs // PACKS_OF_A_CHUNK)
         pool.run(self.function, [job] * max(1, min(torch.get_num_threads(), job.chunks)))
+
+
+def _in_packs(shape: torch.Size, dtype: torch.dtype) -> tuple[int, int, int, int]:
+    """Rows, columns, packs of rays of a shape, and log₂ of a pack's width: see `ops.cpu.crossings`."""
+    rays, lanes = shape.numel(), lanes_of(dtype)
+    columns = shape[-1] if shape else 1
+    rows, wide = rays // columns, lanes // 2
+    packs = -(-rows // 2) * -(-columns // wide)
+    if packs * lanes > _WASTED * rays:
+        rows, columns, wide, packs = 1, rays, lanes, -(-rays // lanes)
+    return rows, columns, packs, wide.bit_length() - 1
 
 
 def _variant(given: Raycast, asked: str, coefficients: Tensor) -> RaycastVariant:

@@ -21,9 +21,9 @@ from filterlab.ops.raycast import Candidates, Raycast, Written, written_in_parts
 
 
 def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
-    """`ops.reference.raycast.first`, fused: t (R,) float64 of rays (R, 3), without derivatives."""
-    t = torch.empty(len(origins), dtype=torch.float64, device=origins.device)
-    _cast(given, "first", origins, directions, {"t": t})
+    """`ops.reference.raycast.first`, fused: t (...) float64 of rays (..., 3), without derivatives."""
+    t = torch.empty(origins.shape[:-1], dtype=torch.float64, device=origins.device)
+    _cast(given, "first", origins.reshape(-1, 3), directions.reshape(-1, 3), {"t": t})
     return t
 
 

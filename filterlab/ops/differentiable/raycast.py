@@ -25,9 +25,10 @@ def missing(given: Raycast, origins: Tensor) -> str | None:
 
 
 def first(given: Raycast, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Tensor:
-    """t (R,) float64, where rays (R, 3) first meet the level; ∞ where they don't. Without derivatives.
+    """t (...) float64, where rays (..., 3) first meet the level; ∞ where they don't. Without derivatives.
 
     Args:
+        origins, directions: those that lie near each other along the last two axes of an image are cast together.
         implementation: "reference", "cpu" or "cuda"; None: the fastest that can run.
     """
     return _driver(given, origins, implementation).first(given, origins, directions)
