@@ -14,7 +14,7 @@ with a coefficient that is not finite may hold anything.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -199,8 +199,8 @@ def layers_of(lattice: Lattice, edge: int) -> Iterator[tuple[Tensor, Tensor]]:
         hull = lattice.scale * _hull(slab, lattice) + lattice.shift
         low = high = hull
         for dim, own in enumerate(reversed(_columns(lattice))):
-            low, high = (_windows(x, dim, own * edge, int(lattice.continuous)) for x in (low, high))
-            low, high = low.amin(-1), high.amax(-1)
+            asked = dim, own * edge, int(lattice.continuous)
+            low, high = over_windows(torch.amin, low, *asked), over_windows(torch.amax, high, *asked)
         yield low, high
 
 
@@ -258,11 +258,16 @@ def _sum(values: Tensor, dim: int, weights: Tensor, cells: int) -> Tensor:
     return sum(terms[1:], terms[0]) if terms else torch.zeros_like(values.narrow(dim, 0, cells))
 
 
-def _windows(values: Tensor, dim: int, step: int, shared: int) -> Tensor:
-    """Along one axis the coefficients of every brick, as a last axis; the last one goes on."""
-    bricks = -(-(values.shape[dim] - shared) // step)
-    more = bricks * step + shared - values.shape[dim]
-    if more:
-        shape = [more if axis == dim else n for axis, n in enumerate(values.shape)]
-        values = torch.cat((values, values.narrow(dim, values.shape[dim] - 1, 1).expand(shape)), dim)
-    return values.unfold(dim, step + shared, step)
+def over_windows(reduce: Callable[..., Tensor], values: Tensor, dim: int, step: int, shared: int) -> Tensor:
+    """Along one axis what `reduce` makes of the numbers of every brick: `step`, and `shared` that the next reads too.
+
+    The last brick may have fewer. Of three axes z goes first: it leaves rows along x as they are in memory.
+
+    Args:
+        reduce: torch.amin or torch.amax.
+    """
+    whole, left = divmod(values.shape[dim] - shared, step)
+    parts = [reduce(values.unfold(dim, step + shared, step), -1)] if whole else []
+    if left:
+        parts.append(reduce(values.narrow(dim, whole * step, left + shared), dim, keepdim=True))
+    return torch.cat(parts, dim)
