@@ -14,6 +14,7 @@ from torch import Tensor
 import filterlab as fl
 from experiments.extremes.contract import Case, Finding, Subject, Tally
 from filterlab.fields.grid import GridField
+from filterlab.fields.tetrahedral import OnTetrahedra
 from filterlab.render import Light, Shading, TransferFunction, render
 
 SIZE = (6, 7, 9)  # D, H, W of the volumes
@@ -91,7 +92,11 @@ def _nan_gradients(subject: Subject, points: Tensor, hit: Tensor, axes: Tensor, 
     close = torch.allclose(by_samples, by_samples_rest, rtol=1e-4, atol=1e-4)
     tally.kept(close, "a NaN point gave the volume a derivative")
     tally.kept(bool(by_points[hit].gather(1, axes[hit, None]).isnan().all()), "a NaN coordinate got a derivative")
-    tally.kept(torch.equal(by_points[~hit], by_points_rest), "derivatives by other points changed")
+    rounding = (
+        1e-5 if fl.METHODS[subject.method].schemes == ("direct",) else 0.0
+    )  # products of matrices sum as they like
+    same = torch.allclose(by_points[~hit], by_points_rest, rtol=rounding, atol=rounding)
+    tally.kept(same, "derivatives by other points changed")
 
 
 # --- infinite and huge -----------------------------------------------------------------------------------------------
@@ -157,6 +162,8 @@ def _huge_in(spacing: float, subject: Subject, random: np.random.Generator, amou
     value, gradient = field.jet(torch.tensor(points, device=subject.device), 1)
     expected, slope = near.jet(torch.tensor(folded, dtype=torch.float32, device=subject.device), 1)
     tally.error(largest(value - expected), "a value that its folded point does not have", count)
+    if isinstance(field.scheme, OnTetrahedra) and fl.METHODS[subject.method].facts.continuity < 1:
+        return  # where tetrahedra meet the gradient is any one's, and not the reflected one's in the other point
     # on a plane of reflection the sign is one of two
     off = (spacing * gradient.abs() - (slope * torch.tensor(signs, device=subject.device).float()).abs()).abs()
     tally.error(largest(off), "a gradient that its folded point does not have", count)
