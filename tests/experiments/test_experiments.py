@@ -53,6 +53,7 @@ def tiny(name, scan):
             "markers": 9,
             "dimensions": [1],
         },
+        "partitions": {"splines": ["quadratic-c1", "qss"], "fineness": 2},
         "rms_error": {
             "studies": [{"signal": "gaussian", "resolutions": [4, 6], "fit_from": 4}],
             "methods": ["trilinear", {"name": "trilinear", "gradient": "central"}, "notch"],
