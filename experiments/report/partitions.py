@@ -148,7 +148,7 @@ def _whole(axes: Axes, cell: Cell) -> None:
     skin = cell.skin
     front = Polygons(skin.corners, skin.colors, edges=0.5).facing(EYE)
     solids.draw(axes, EYE, [front])
-    solids.lines(axes, EYE, _front(cell), 1.3)
+    solids.lines(axes, EYE, _front(cell), 1.3, color=solids.EDGE)
 
 
 def _front(cell: Cell, at: np.ndarray | float = 0.0) -> np.ndarray:
@@ -184,7 +184,7 @@ def _among(axes: Axes, cell: Cell) -> None:
         skin = cell.skin
         colors = skin.colors if home else np.full_like(skin.colors, 0.82)
         solids.draw(axes, EYE, [Polygons(skin.corners + at, colors).facing(EYE)])
-        solids.lines(axes, EYE, _front(cell, at), 1.1 if home else 0.7)
+        solids.lines(axes, EYE, _front(cell, at), 1.1 if home else 0.7, color=solids.EDGE)
         solids.dots(axes, EYE, _samples(cell, at), "#ffffff", 12)
 
 

@@ -17,6 +17,7 @@ from matplotlib.colors import to_rgb
 from experiments.report.plots import INK
 
 LIGHT = (0.35, 0.25, 0.9)  # along the page's right and up, and towards the eye
+EDGE = "#20272e"  # on what is opaque, whatever the page
 _DARKEST = 0.55
 _ORDER = 1  # of whatever is drawn: what comes later covers what came before
 
@@ -96,7 +97,7 @@ def draw(axes: Axes, eye: Eye, polygons: Sequence[Polygons]) -> None:
         seen = eye.seen(group.corners)
         order = np.argsort(seen[..., 2].mean(-1))
         faces = np.column_stack([group.shaded(eye), np.full(len(order), group.opacity)])[order]
-        outlines = INK if group.edges else faces
+        outlines = (EDGE if group.opacity == 1 else INK) if group.edges else faces
         width = group.edges or (0.3 if group.opacity == 1 else 0.0)
         axes.add_collection(
             PolyCollection(
@@ -115,7 +116,7 @@ def lines(axes: Axes, eye: Eye, segments: np.ndarray, width: float = 0.8, style:
 def dots(axes: Axes, eye: Eye, points: np.ndarray, color: str | np.ndarray, size: float) -> None:
     """Draws points (P, 3) as discs."""
     seen = eye.seen(points)
-    axes.scatter(seen[:, 0], seen[:, 1], s=size, c=color, edgecolors=INK, linewidths=0.6, zorder=_ORDER)
+    axes.scatter(seen[:, 0], seen[:, 1], s=size, c=color, edgecolors=EDGE, linewidths=0.6, zorder=_ORDER)
 
 
 def frame(axes: Axes, title: str) -> None:
