@@ -17,9 +17,10 @@ import torch
 
 from filterlab.fields.octahedral import QUADRATIC_C1
 from filterlab.fields.tetrahedral import Mask, Vector
+from filterlab.fields.type6 import CUBIC_C1, QSS
 from tests import tetrahedral_oracle as oracle
 
-SPLINES = {spline.name: spline for spline in (QUADRATIC_C1,)}
+SPLINES = {spline.name: spline for spline in (QSS, CUBIC_C1, QUADRATIC_C1)}
 every_spline = pytest.mark.parametrize("name", SPLINES)
 
 SAMPLES = {"qss": (27, 27), "cubic-c1": (23, 27), "quadratic-c1": (28, 88)}  # of a tetrahedron, of a cell
@@ -217,7 +218,7 @@ def _polar(power: tuple[int, ...], arguments: Named) -> Fraction:
 # ---- smoothness
 
 
-@pytest.mark.parametrize("name", ["quadratic-c1"])
+@pytest.mark.parametrize("name", ["cubic-c1", "quadratic-c1"])
 def test_gradients_are_continuous_across_every_kind_of_face(name):
     assert [c.violated for c in connections(name)] == [()] * (4 * len(SPLINES[name].shapes))
 

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from filterlab.bernstein import Index, multi_indices
-from filterlab.fields.tetrahedral import Mask, Shape, Spline, Vector
+from filterlab.fields.tetrahedral import Mask, Shape, Spline, Vector, weighted
 
 Weights = tuple[int, int, int, int]
 
@@ -67,11 +67,7 @@ def _shape(kind: Sequence[Weights]) -> Shape:
 def _mask(alpha: Index, weights: Sequence[Weights], vertices: Sequence[Vector]) -> Mask:
     """Σ_k w_ik T_k((c_k + v_j) / 2)."""
     i, j = (n for n, power in enumerate(alpha) for _ in range(power))
-    total: dict[Vector, Fraction] = {}
-    for w, c in zip(weights[i], _CENTRES, strict=True):
-        for sample, weight in _linear(c, vertices[j]).items():
-            total[sample] = total.get(sample, Fraction(0)) + Fraction(w, 8) * weight
-    return {sample: weight for sample, weight in total.items() if weight}
+    return weighted(*((Fraction(w, 8), _linear(c, vertices[j])) for w, c in zip(weights[i], _CENTRES, strict=True)))
 
 
 def _linear(c: tuple[int, int, int], v: Vector) -> Mask:
