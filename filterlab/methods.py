@@ -19,6 +19,7 @@ from filterlab import kernels, missing_values, prefilters
 from filterlab.fields.base import Field
 from filterlab.fields.grid import Coefficients, GridField, Scheme, Term, implementation_of
 from filterlab.fields.ncrsi import NCRSI_TERMS, SevenSamples
+from filterlab.fields.octahedral import QUADRATIC_C1
 from filterlab.fields.storage import named_storage
 from filterlab.fields.tensor_product import (
     Direct,
@@ -356,6 +357,12 @@ METHODS: dict[str, Method] = {
         ),
         Tetrahedral("qss", "prefiltered quadratic super spline on 24 tetrahedra a cube: C1 across cubes", QSS, 0),
         Tetrahedral("cubic-c1", "prefiltered cubic spline on the same: C1, degree 3 along any ray", CUBIC_C1, 1),
+        Tetrahedral(
+            "quadratic-c1",
+            "prefiltered quadratic spline on truncated octahedra: C1, degree 2 along any ray",
+            QUADRATIC_C1,
+            1,
+        ),
     )
 }
 

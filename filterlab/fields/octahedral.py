@@ -67,8 +67,7 @@ def _shape(kind: Sequence[Weights]) -> Shape:
 def _mask(alpha: Index, weights: Sequence[Weights], vertices: Sequence[Vector]) -> Mask:
     """Σ_k w_ik T_k((c_k + v_j) / 2)."""
     i, j = (n for n, power in enumerate(alpha) for _ in range(power))
-    parts = zip(weights[i], _CENTRES, strict=True)
-    return weighted(*((Fraction(w, 8), _linear(c, vertices[j])) for w, c in parts))
+    return weighted(*((Fraction(w, 8), _linear(c, vertices[j])) for w, c in zip(weights[i], _CENTRES, strict=True)))
 
 
 def _linear(c: tuple[int, int, int], v: Vector) -> Mask:

@@ -19,7 +19,7 @@ over points.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -63,6 +63,10 @@ class Shape:
 
     vertices: tuple[Vector, Vector, Vector, Vector]
     masks: Mapping[Index, Mask]
+
+    def row(self, alpha: Index, samples: Sequence[Vector]) -> tuple[float, ...]:
+        """The weights of a mask, of all of these samples."""
+        return tuple(float(self.masks[alpha].get(o, 0)) for o in samples)
 
     @cached_property
     def barycentric(self) -> tuple[tuple[Fraction, ...], ...]:
@@ -139,7 +143,8 @@ class Tables:
 
     Attributes:
         barycentric: (S, 4, 4), see `Shape.barycentric`.
-        masks: (S·B, K), in the order of `multi_indices` and of `Spline.samples`.
+        masks: (R, K), those that differ, in the order of `Spline.samples`.
+        rows: (B, S), which of them a shape's coefficients are, in the order of `multi_indices`.
         derivatives: of order r = 0, 1, 2: (S·J, B_r), from coefficients of degree r to the J rows of that order, along
             the axes of the cone.
         ahead, behind: for each axis of the cone the distinct coordinates of samples, as steps of the index from the
@@ -149,6 +154,7 @@ class Tables:
 
     barycentric: Tensor
     masks: Tensor
+    rows: Tensor
     derivatives: tuple[Tensor, ...]
     ahead: tuple[Tensor, ...]
     behind: tuple[Tensor, ...]
@@ -157,12 +163,14 @@ class Tables:
     @classmethod
     def of(cls, spline: Spline) -> Tables:
         indices = multi_indices(spline.degree, 3)
-        masks = [[float(s.masks[a].get(o, 0)) for o in spline.samples] for s in spline.shapes for a in indices]
+        distinct: dict[tuple[float, ...], int] = {}
+        rows = [[distinct.setdefault(s.row(a, spline.samples), len(distinct)) for s in spline.shapes] for a in indices]
         barycentric = np.array([shape.barycentric for shape in spline.shapes], dtype=np.float64)
         along = [sorted({o[axis] for o in spline.samples}) for axis in range(3)]
         return cls(
             torch.tensor(barycentric),
-            torch.tensor(masks, dtype=torch.float64),
+            torch.tensor(list(distinct), dtype=torch.float64),
+            torch.tensor(rows),
             tuple(torch.tensor(_derivative_rows(barycentric, spline.degree, order)) for order in range(3)),
             tuple(torch.tensor([int(spline.shift + o) for o in row]) for row in along),
             tuple(torch.tensor([int(spline.shift - o) for o in row]) for row in along),
@@ -176,6 +184,7 @@ class Tables:
         return Tables(
             self.barycentric.to(device),
             self.masks.to(device),
+            self.rows.to(device),
             moved(self.derivatives),
             moved(self.ahead),
             moved(self.behind),
@@ -395,16 +404,23 @@ class JetOnTetrahedra:
         if entry is not None:
             index = index + entry * math.prod(self.values.shape[2:])
         samples = flat.index_select(1, index.reshape(-1)).reshape(len(flat), *index.shape).to(points.dtype)
-        rows = torch.cat(self._jet(self._applied(self.tables.masks, samples, at), at), 1)
+        rows = torch.cat(self._jet(self._coefficients(samples, at), at), 1)
         # NaN where a coordinate is, and its derivative by that one; no other has any, nor do the samples
         poison = (voxels * torch.where(unknown, torch.nan, 0.0)).sum(-1).to(rows.dtype)
         return torch.where(unknown.any(-1), 0.0, rows) + poison
 
-    def _applied(self, matrices: Tensor, vectors: Tensor, at: Located) -> Tensor:
-        """(S·R, Q) of every point's own shape times (C, Q, P): (C, R, P)."""
-        found = matrices.to(vectors.dtype) @ vectors
-        shapes = len(self.spline.shapes)
-        return _of_shape(found.unflatten(1, (shapes, -1)).transpose(0, 1), at.shape)
+    def _coefficients(self, samples: Tensor, at: Located) -> Tensor:
+        """(C, K, P) to the Bernstein coefficients (C, B, P) of every point's own shape."""
+        found = _product(self.tables.masks, samples)
+        if at.shape is None:
+            return found
+        row = self.tables.rows.index_select(1, at.shape)
+        return found.gather(1, row.expand(len(found), *row.shape))
+
+    def _derivatives(self, order: int, coefficients: Tensor, at: Located) -> Tensor:
+        """(C, B_r, P) to the rows (C, J, P) of that order along the axes of the cone."""
+        found = _product(self.tables.derivatives[order], coefficients)
+        return _of_shape(found.unflatten(1, (len(self.spline.shapes), -1)).transpose(0, 1), at.shape)
 
     def _jet(self, coefficients: Tensor, at: Located) -> list[Tensor]:
         """Rows (C, ·, P) of each order, of Bernstein coefficients (C, B, P)."""
@@ -414,8 +430,17 @@ class JetOnTetrahedra:
         for order in range(min(self.order, degree), -1, -1):
             steps = bernstein.degree_of(pieces, 3) - order
             pieces = bernstein.blossom(pieces, [weights] * steps)
-            rows.append(_turned(self._applied(self.tables.derivatives[order], pieces.movedim(-1, 1), at), at, order))
+            rows.append(_turned(self._derivatives(order, pieces.movedim(-1, 1), at), at, order))
         return rows[::-1]
+
+
+def _product(matrix: Tensor, columns: Tensor) -> Tensor:
+    """(R, Q) times (C, Q, P): (C, R, P). What a point gets depends on no other point: BLAS does not promise that."""
+    matrix = matrix.to(columns.dtype)
+    total = matrix[:, 0, None] * columns[:, 0, None]
+    for q in range(1, columns.shape[1]):
+        total = torch.addcmul(total, matrix[:, q, None], columns[:, q, None])
+    return total
 
 
 def _turned(rows: Tensor, at: Located, order: int) -> Tensor:
