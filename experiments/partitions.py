@@ -19,28 +19,33 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from skimage.measure import marching_cubes
 
 from experiments.config import ExperimentConfig
 from experiments.runs import Record, Run, Unit
 from filterlab import bernstein
 from filterlab.bernstein import multi_indices
-from filterlab.fields.octahedral import QUADRATIC_C1
 from filterlab.fields.tetrahedral import Shape, Spline
-from filterlab.fields.type6 import CUBIC_C1, QSS
+from filterlab.io.config import unknown_name
+from filterlab.methods import METHODS, Tetrahedral
 
-SPLINES = {spline.name: spline for spline in (QSS, CUBIC_C1, QUADRATIC_C1)}
-Name = Literal["qss", "cubic-c1", "quadratic-c1"]
+SPLINES = {name: method.spline for name, method in METHODS.items() if isinstance(method, Tetrahedral)}
 
 _SAMPLES = 8  # along an axis: a cell in the middle, and all that it needs
+
+
+def _known(name: str) -> str:
+    if name not in SPLINES:
+        raise ValueError(unknown_name("spline", name, SPLINES))
+    return name
 
 
 class Config(ExperimentConfig):
     """Cells of splines, and patches in them."""
 
     experiment: Literal["partitions"]
-    splines: Annotated[list[Name], Field(min_length=1)]
+    splines: Annotated[list[Annotated[str, AfterValidator(_known)]], Field(min_length=1)]
     noise: Annotated[float, Field(ge=0)] = 1.0
     fineness: Annotated[int, Field(ge=2, le=64)] = 6
 

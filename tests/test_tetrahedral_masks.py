@@ -15,12 +15,11 @@ import numpy as np
 import pytest
 import torch
 
-from filterlab.fields.octahedral import QUADRATIC_C1
 from filterlab.fields.tetrahedral import Mask, Vector
-from filterlab.fields.type6 import CUBIC_C1, QSS
+from filterlab.methods import METHODS, Tetrahedral
 from tests import tetrahedral_oracle as oracle
 
-SPLINES = {spline.name: spline for spline in (QSS, CUBIC_C1, QUADRATIC_C1)}
+SPLINES = {name: method.spline for name, method in METHODS.items() if isinstance(method, Tetrahedral)}
 every_spline = pytest.mark.parametrize("name", SPLINES)
 
 SAMPLES = {"qss": (27, 27), "cubic-c1": (23, 27), "quadratic-c1": (28, 88)}  # of a tetrahedron, of a cell

@@ -29,6 +29,11 @@ def patches(name: str, asked: Config) -> tuple[float, list[np.ndarray]]:
     return level, [patch(piece, b, level, asked.fineness) for piece, b in found]
 
 
+def test_methods_that_are_no_splines_on_tetrahedra_are_refused():
+    with pytest.raises(ValueError, match="unknown spline 'tricubic'"):
+        config("tricubic")
+
+
 @every_spline
 def test_tetrahedra_are_the_oracles(name):
     expected = {frozenset(t.vertices) for t in oracle.SPLINES[name].tetrahedra}
