@@ -13,9 +13,10 @@ import filterlab as fl
 from filterlab import bernstein, kernels
 from filterlab.fields import ranges as bounds
 from filterlab.kernels import KERNELS
-from filterlab.methods import METHODS, from_kernel
+from filterlab.methods import from_kernel
 from filterlab.ops.reference import bounds as hulls
 from tests import oracles
+from tests.test_methods import TENSOR_PRODUCTS
 
 BOUNDARIES = [str(b) for b in fl.Boundary]
 AFFINE = np.array([[1.0, 0.2, 0.0, 3.0], [0.0, 0.5, 0.1, 1.0], [0.1, 0.0, 2.0, -5.0], [0.0, 0.0, 0.0, 1.0]])
@@ -68,7 +69,7 @@ def within(pieces, count: int = 3) -> Tensor:
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_pieces_are_the_field_as_its_definition_gives_it(method, boundary):
     volume = fl.Volume(samples(4, 5, 6), affine=AFFINE)
     field = fl.reconstruct(volume, method, boundary=boundary)
@@ -85,7 +86,7 @@ def test_pieces_are_the_field_as_its_definition_gives_it(method, boundary):
 DEGREES = {"trilinear": 3, "ncrsi": 5, "triquadratic": 6, "notch": 6, "catmull-rom": 9, "mitchell": 9, "tricubic": 9}
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_degrees_along_rays(method):
     assert fl.reconstruct(samples(3, 3, 3), method).degree_along_rays == DEGREES[method]
 
@@ -114,7 +115,7 @@ def test_pieces_of_a_kernel_that_is_a_tensor():
 
 
 @pytest.mark.parametrize("storage", ["float16", "bfloat16", "float32", "int16", "uint8"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_storage(method, storage):
     field = fl.reconstruct(100 + 7 * samples(4, 5, 6), method, storage=storage)
     origins, directions = rays(field)
@@ -125,7 +126,7 @@ def test_storage(method, storage):
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_pieces_cover_the_domain_and_share_their_ends(method, boundary):
     """Without gap or overlap from where a ray enters to where it leaves, and equal to the bit where two meet."""
     field = fl.reconstruct(fl.Volume(samples(4, 5, 6), affine=AFFINE), method, boundary=boundary)
@@ -145,7 +146,7 @@ def test_pieces_cover_the_domain_and_share_their_ends(method, boundary):
         assert torch.equal(pieces.coefficients[1:][joined[1:], 0], pieces.coefficients[:-1][joined[1:], -1])
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_pieces_of_awkward_rays(method):
     field = fl.reconstruct(fl.Volume(samples(4, 5, 6), affine=AFFINE), method)
     origins, directions = awkward_rays(field)
@@ -159,7 +160,7 @@ def test_pieces_of_awkward_rays(method):
     assert float(error.max()) < 1e-8  # from afar: the rounding of o + t d itself
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_float32_is_rounded_only(method):
     field = fl.reconstruct(samples(6, 6, 6), method, boundary="reflect")
     origins, directions = (x.float() for x in rays(field))
@@ -204,7 +205,7 @@ def straddling(pieces, level: float) -> list[tuple[int, float, float]]:
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_bounds_hold_everywhere_in_a_brick(method, boundary):
     field = fl.reconstruct(fl.Volume(samples(9, 7, 6)), method, boundary=boundary, storage="int16")
     lattice = field.lattice
@@ -216,7 +217,7 @@ def test_bounds_hold_everywhere_in_a_brick(method, boundary):
     assert bool((found.codes.most(found.high[part]) >= values - 1e-12).all())
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_no_piece_that_may_hold_the_level_is_left_out(method):
     field = fl.reconstruct(samples(12, 11, 10) ** 6, method)
     origins, directions = rays(field, 60)

@@ -11,13 +11,12 @@ from torch import Tensor
 import filterlab as fl
 from filterlab.fields import ranges
 from filterlab.kernels import KERNELS, LINEAR, TensorKernel
-from filterlab.methods import METHODS, from_kernel, tensor_product
+from filterlab.methods import from_kernel
 from filterlab.ops import cpu
 from filterlab.ops.bounds import CODES, Codes
 from filterlab.ops.differentiable import bounds as bounds_of
 from filterlab.ops.pieces import Lattice
-
-METHODS_OF_TAPS = [name for name in METHODS if tensor_product(name) is not None]
+from tests.test_methods import TENSOR_PRODUCTS
 
 
 def samples(*shape: int) -> Tensor:
@@ -40,7 +39,7 @@ def assert_alike(lattice: Lattice) -> None:
 
 
 @pytest.mark.parametrize("boundary", ["mirror", "zeros"])
-@pytest.mark.parametrize("method", METHODS_OF_TAPS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_the_same_bounds(method, boundary):
     assert_alike(fl.reconstruct(samples(6, 5, 9), method, boundary=boundary).lattice)
 
