@@ -187,6 +187,14 @@ def test_it_can_be_recommended(name):
     assert answer.field(volume)(torch.zeros(2, 3)).shape == (2,)
 
 
+def test_a_field_compiles_whole():
+    torch._dynamo.reset()
+    field = fl.reconstruct(fl.Volume(samples(4, 5, 6).float(), spacing=(1, 2, 0.5)), "qss")
+    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0)) * 9 - 2
+    whole = torch.compile(field, fullgraph=True, backend="eager")
+    laws.assert_close(whole(points), field(points), 1e-6)
+
+
 # ---- the tables themselves
 
 
