@@ -21,6 +21,7 @@ from filterlab.fields.grid import Coefficients, GridField, Scheme, Term, impleme
 from filterlab.fields.ncrsi import NCRSI_TERMS, SevenSamples
 from filterlab.fields.octahedral import QUADRATIC_C1
 from filterlab.fields.storage import named_storage
+from filterlab.fields.tetrahedral_pieces import FieldOnTetrahedra
 from filterlab.fields.tensor_product import (
     Direct,
     EightTrilinearCubic,
@@ -284,7 +285,7 @@ class Tetrahedral(Method):
     def build(self, volume: Volume, asked: Asked) -> Field:
         scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
         coefficients = asked.coefficients(self.prefilter, scheme.reach, named_storage(asked.storage))
-        return GridField(self.name, volume, coefficients, scheme)
+        return FieldOnTetrahedra(self.name, volume, coefficients, scheme)
 
 
 _FORMER_SCHEMES = {"eight_trilinear": "sampled"}

@@ -332,15 +332,10 @@ class GridField(Field):
         cells = straddling(self.lattice, level)
         return Relevant(cells, cells)
 
-    def no_pieces(self) -> TypeError:
-        if self.scheme.terms:
-            return super().no_pieces()
-        return TypeError(f"{self.method}: pieces are found on the grid's cells only, and this field has others")
-
     def _check_pieces(self) -> None:
         if self.channels is not None:
             raise ValueError("pieces are those of one channel: `select` it from this batched field")
-        if not self.scheme.exact:
+        if self.degree_along_rays is None:
             raise self.no_pieces()
 
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:

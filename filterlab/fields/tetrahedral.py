@@ -414,12 +414,12 @@ class JetOnTetrahedra:
         if entry is not None:
             index = index + entry * math.prod(self.values.shape[2:])
         samples = flat.index_select(1, index.reshape(-1)).reshape(len(flat), *index.shape).to(points.dtype)
-        rows = torch.cat(self._jet(self._coefficients(samples, at), at), 1)
+        rows = torch.cat(self._jet(self.coefficients(samples, at), at), 1)
         # NaN where a coordinate is, and its derivative by that one; no other has any, nor do the samples
         poison = (voxels * torch.where(unknown, torch.nan, 0.0)).sum(-1).to(rows.dtype)
         return torch.where(unknown.any(-1), 0.0, rows) + poison
 
-    def _coefficients(self, samples: Tensor, at: Located) -> Tensor:
+    def coefficients(self, samples: Tensor, at: Located) -> Tensor:
         """(C, K, P) to the Bernstein coefficients (C, B, P) of every point's own shape."""
         found = _product(self.tables.masks, samples)
         if at.shape is None:
