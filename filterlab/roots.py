@@ -604,8 +604,7 @@ def _all(rows: Rows) -> Tensor:
     """t (n, B), ascending, ∞ where there are no more."""
     n = len(rows) - 1
     binomial = [comb(n, i) * r for i, r in enumerate(rows)]
-    left = _Cut.of(binomial)
-    right = _Cut.of([comb(n, i) * r for i, r in enumerate(reversed(rows))])
+    left, right = _Cut.of([torch.cat(both) for both in zip(binomial, reversed(binomial), strict=True)]).halves()
     bounds = torch.cat((left.bounds / (1 + left.bounds), (1 / (1 + right.bounds)).flip(0)))
     zero = torch.cat((left.values == 0, (right.values == 0).flip(0)))
     first = zero.clone()
@@ -641,6 +640,11 @@ class _Cut(NamedTuple):
         sizes = _horner([r.abs() for r in rows], bounds)[0]
         values = torch.where(values.abs() <= _tolerance(len(rows) - 1, sizes.dtype) * sizes, 0, values)
         return cls(bounds, values, _between(rows, bounds, values))
+
+    def halves(self) -> tuple[Self, Self]:
+        """Of the first and of the second half of the polynomials."""
+        first, second = zip(*(part.chunk(2, 1) for part in self), strict=True)
+        return type(self)(*first), type(self)(*second)
 
 
 def _between(rows: Rows, bounds: Tensor, values: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import tempfile
@@ -27,6 +28,11 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compiled programs go to a folder of this run, which its workers and the processes of its tests share."""
     if not _BY_A_WORKER:
         os.environ["FILTERLAB_CACHE"] = tempfile.mkdtemp(prefix="filterlab-tests-")
+
+
+def pytest_collection_finish() -> None:
+    """Half a million objects are there to stay: walking them takes the garbage collector 0.4 s each time."""
+    gc.freeze()
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

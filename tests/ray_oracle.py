@@ -88,9 +88,7 @@ def crossings(f: Sum, origins: np.ndarray, directions: np.ndarray, level: float,
     values = f((o[ray, None] + t[..., None] * d[ray, None]).reshape(-1, 3)).reshape(t.shape) - level
     c = np.linalg.solve(chebyshev.chebvander(nodes, f.degree), values.T)  # (n + 1, P)
     stops = np.sort(np.concatenate((-np.ones((len(ray), 1)), _critical(c), np.ones((len(ray), 1))), 1), 1)
-    at = _value(c, stops)
-    found = [_one(ray == r, low, high, c, stops, at, close) for r in range(len(o))]
-    return found
+    return _between(len(o), ray, low, high, c, stops, close)
 
 
 def _ends(f: Sum, o: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -134,40 +132,40 @@ def _value(c: np.ndarray, x: np.ndarray) -> np.ndarray:
     return chebyshev.chebval(x.T, c[:, None] if c.ndim > 1 else c, tensor=False).T
 
 
-def _one(own: np.ndarray, low, high, c, stops, at, close: float) -> Truth:
-    if not own.any():
-        return Truth(np.zeros(0), np.inf)
-    low, high, c, stops, at = low[own], high[own], c[:, own], stops[own], at[own]
-    piece = np.repeat(np.arange(len(low)), stops.shape[1])
-    x, v = stops.ravel(), at.ravel()
+def _between(rays: int, ray, low, high, c, stops, close: float) -> list[Truth]:
+    """Crossings between stops (P, K) of pieces (P) in the order of rays, on each of which f is monotone."""
+    own = np.repeat(ray, stops.shape[1])
+    piece, x, v = np.repeat(np.arange(len(ray)), stops.shape[1]), stops.ravel(), _value(c, stops).ravel()
     turns = np.abs(v) < close  # too close to tell: fine where f is clearly monotone through it
-    before, after = np.roll(v, 1), np.roll(v, -1)
-    before[0], after[-1] = 0, 0
+    follows = np.concatenate(([False], own[1:] == own[:-1], [False]))
+    before = np.where(follows[:-1], np.roll(v, 1), 0)
+    after = np.where(follows[1:], np.roll(v, -1), 0)
     through = (np.abs(before) >= close) & (np.abs(after) >= close) & (before * after < 0)
-    inner = np.abs(x) < 1
-    doubt = np.abs(v[turns & (inner | ~through)])
-    if len(doubt):
-        return Truth(np.zeros(0), float(doubt.min()))
-    keep = ~turns
-    piece, x, v = piece[keep], x[keep], v[keep]
-    places = list(zip(piece, x, strict=True))
-    turns = np.nonzero(v[:-1] * v[1:] < 0)[0]
-    found = [_bisected(c, low, high, places[i], places[i + 1], v[i]) for i in turns]
-    return Truth(np.array(found), np.inf)
+    undecided = np.full(rays, np.inf)
+    doubt = turns & ((np.abs(x) < 1) | ~through)
+    np.minimum.at(undecided, own[doubt], np.abs(v[doubt]))
+    keep = ~turns & np.isinf(undecided[own])
+    own, piece, x, v = own[keep], piece[keep], x[keep], v[keep]
+    start = np.nonzero((v[:-1] * v[1:] < 0) & (own[:-1] == own[1:]))[0]
+    end = start + 1
+    t = _bisected(c, low, high, (piece[start], x[start]), (piece[end], x[end]), v[start])
+    found = np.split(t, np.searchsorted(own[start], np.arange(1, rays)))
+    return [Truth(*one) for one in zip(found, undecided.tolist(), strict=True)]
 
 
-def _bisected(c, low, high, start: tuple[int, float], end: tuple[int, float], sign: float) -> float:
+def _bisected(c, low, high, start: tuple[np.ndarray, ...], end: tuple[np.ndarray, ...], sign: np.ndarray) -> np.ndarray:
     """t between two places, (piece, x) each, where the polynomials change from the sign at the first."""
     (p, a), (q, b) = start, end
-    while p < q:  # the pieces between, some of no length
-        if chebyshev.chebval(1.0, c[:, p]) * sign <= 0:
-            b, q = 1.0, p
-        else:
-            p, a = p + 1, -1.0
+    while (apart := p < q).any():  # the pieces between, some of no length
+        here = apart & (c[:, p].sum(0) * sign <= 0)
+        b, q = np.where(here, 1.0, b), np.where(here, p, q)
+        a, p = np.where(apart & ~here, -1.0, a), p + (apart & ~here)
+    c = c[:, p]
     for _ in range(60):
         middle = (a + b) / 2
-        a, b = (middle, b) if chebyshev.chebval(middle, c[:, p]) * sign > 0 else (a, middle)
-    return float(low[p] + (high[p] - low[p]) * np.longdouble(a + 1) / 2)
+        beyond = chebyshev.chebval(middle, c, tensor=False) * sign > 0
+        a, b = np.where(beyond, middle, a), np.where(beyond, b, middle)
+    return (low[p] + (high[p] - low[p]) * (a + 1).astype(np.longdouble) / 2).astype(np.float64)
 
 
 def judged(truth: Sequence[Truth], t: np.ndarray, tolerance: float) -> dict[str, int]:

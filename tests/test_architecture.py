@@ -6,6 +6,7 @@ import ast
 import itertools
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,7 @@ def room(path: Path) -> str:
     return part.removesuffix(".py")
 
 
+@cache
 def imported_modules(path: Path) -> set[str]:
     """Dotted names of everything that a file imports, wherever the import stands."""
     names: set[str] = set()

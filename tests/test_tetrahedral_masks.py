@@ -15,12 +15,11 @@ import numpy as np
 import pytest
 import torch
 
-from filterlab.fields.octahedral import QUADRATIC_C1
 from filterlab.fields.tetrahedral import Mask, Vector
-from filterlab.fields.type6 import CUBIC_C1, QSS
+from filterlab.methods import METHODS, Tetrahedral
 from tests import tetrahedral_oracle as oracle
 
-SPLINES = {spline.name: spline for spline in (QSS, CUBIC_C1, QUADRATIC_C1)}
+SPLINES = {name: method.spline for name, method in METHODS.items() if isinstance(method, Tetrahedral)}
 every_spline = pytest.mark.parametrize("name", SPLINES)
 
 SAMPLES = {"qss": (27, 27), "cubic-c1": (23, 27), "quadratic-c1": (28, 88)}  # of a tetrahedron, of a cell
@@ -221,6 +220,11 @@ def _polar(power: tuple[int, ...], arguments: Named) -> Fraction:
 @pytest.mark.parametrize("name", ["cubic-c1", "quadratic-c1"])
 def test_gradients_are_continuous_across_every_kind_of_face(name):
     assert [c.violated for c in connections(name)] == [()] * (4 * len(SPLINES[name].shapes))
+
+
+def test_quadratic_super_splines_are_smooth_across_cubes_and_not_within():
+    """Across v_0's face all conditions hold; across the others, which meet in v_0, all but those of β = v_0."""
+    assert [(c.opposite, c.violated) for c in connections("qss")] == [(0, ()), (1, ((0,),)), (2, ((0,),)), (3, ((0,),))]
 
 
 def test_octahedra_meet_in_eight_ways():

@@ -215,14 +215,12 @@ def _hits(settings: Settings) -> Race:
     task = surfaces.task_of(settings, _IMAGE * settings.image, device="cuda")
     rays = task.origins, task.directions
     contestants = [
-        _finished(
-            method, partial(surfaces.hits_and_normals, surfaces.surface_of(task, method), task), None, len(rays[0])
-        )
+        _finished(method, partial(surfaces.hits_and_normals, surfaces.surface_of(task, method), task), None, task.rays)
         for method in surfaces.SEARCHED
     ]
     surface = surfaces.surface_of(task, "triquadratic")
     contestants.append(
-        _finished("program", lambda: (surface.field.first_crossing(*rays, task.level),), None, len(rays[0]))
+        _finished("program", lambda: (surface.field.first_crossing(*rays, task.level),), None, task.rays)
     )
     what = f"{surfaces.described(task)}: first hits and normals; triquadratic hits alone: program"
     return Race(what, contestants, [Ratio("triquadratic", "trilinear"), Ratio("triquadratic", "program")])
@@ -235,7 +233,7 @@ def _hits_direct(settings: Settings) -> Race:
         surface = surfaces.surface_of(task, "triquadratic", scheme)
         return lambda: tuple(x.nan_to_num(posinf=0) for x in surfaces.hits_and_normals(surface, task))
 
-    contestants = [_finished(scheme, cast(scheme), "hits", len(task.origins)) for scheme in ("fused", "direct")]
+    contestants = [_finished(scheme, cast(scheme), "hits", task.rays) for scheme in ("fused", "direct")]
     return Race(surfaces.described(task), contestants, [Ratio("fused", "direct")], tolerance=1e-2)
 
 
@@ -243,8 +241,8 @@ def _hits_adjoint(settings: Settings) -> Race:
     task = surfaces.task_of(settings, _IMAGE * settings.image, device="cuda")
     forward, both = surfaces.ways_of(task)
     contestants = [
-        _finished("forward", forward, None, len(task.origins)),
-        _finished("both ways", both, None, len(task.origins)),
+        _finished("forward", forward, None, task.rays),
+        _finished("both ways", both, None, task.rays),
     ]
     what = f"{surfaces.described(task)}: gradients of depths and normals to samples and origins, triquadratic"
     return Race(what, contestants, [Ratio("both ways", "forward")])

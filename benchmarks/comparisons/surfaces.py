@@ -35,14 +35,14 @@ _PLAIN = 64  # pixels along an edge of what plain torch casts
 def task_of(settings: Settings, size: int | None = None, voxels: int | None = None, device: str = "cpu") -> Casting:
     scene = marschner_lobb(voxels or settings.image_voxels, size or 2 * settings.image)
     origins, directions = scene.camera.rays(scene.size, scene.size)
-    origins, directions = (x.expand(directions.shape).reshape(-1, 3).float() for x in (origins, directions))
+    origins, directions = (x.expand(directions.shape).float() for x in (origins, directions))
     volume, origins, directions = (x.contiguous().to(device) for x in (scene.volume, origins, directions))
     return Casting(volume, _LEVEL, origins, directions, settings.threads)
 
 
 def described(task: Casting) -> str:
     n = task.volume.shape[-1]
-    return f"Marschner-Lobb {n}³ float32, level {task.level:g}, {len(task.origins):,} rays"
+    return f"Marschner-Lobb {n}³ float32, level {task.level:g}, {task.rays:,} rays"
 
 
 def surface_of(task: Casting, method: str, scheme: str = "fused") -> LevelSet:
@@ -62,7 +62,7 @@ def _hits(task: Casting, method: str, scheme: str = "fused", name: str | None = 
     surface = surface_of(task, method, scheme)
     call = lambda: hits_and_normals(surface, task)  # noqa: E731
     computes = task.computes if method == "trilinear" else f"{method} hits"
-    return Contestant(name or method, call, computes, lambda found: task.summary(found[0].numpy()), len(task.origins))
+    return Contestant(name or method, call, computes, lambda found: task.summary(found[0].numpy()), task.rays)
 
 
 def _first(settings: Settings) -> Race:
@@ -88,7 +88,7 @@ def _new_level(settings: Settings) -> Race:
     levels = cycle(_LEVELS)
 
     call = lambda: hits_and_normals(LevelSet(field, next(levels)), task)  # noqa: E731
-    contestants, absent, bars = [Contestant("triquadratic", call, samples=len(task.origins))], {}, {embree_mesh: "1/3"}
+    contestants, absent, bars = [Contestant("triquadratic", call, samples=task.rays)], {}, {embree_mesh: "1/3"}
     ratios = []
     for peer in (embree_mesh, vtk_flying_edges):
         if why := peer.missing():
@@ -134,8 +134,8 @@ def _backward(settings: Settings) -> Race:
     task = task_of(settings)
     forward, both = ways_of(task)
     contestants = [
-        Contestant("forward", forward, samples=len(task.origins)),
-        Contestant("forward + backward", both, samples=len(task.origins)),
+        Contestant("forward", forward, samples=task.rays),
+        Contestant("forward + backward", both, samples=task.rays),
     ]
     ratios = [Ratio("forward + backward", "forward", at_most("3"))]
     return Race(f"{described(task)}: gradients of depths and normals to samples and origins", contestants, ratios)

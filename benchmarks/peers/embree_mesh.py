@@ -22,8 +22,8 @@ def missing() -> str | None:
 
 def casting(task: Casting) -> Contestant:
     """The rays alone: triangles and tree are made beforehand."""
-    scene, rays = built(task, task.level), _rays(task)
-    return Contestant(NAME, lambda: _traced(scene, rays), samples=len(task.origins))
+    scene, rays = built(task, task.level), task.flat()
+    return Contestant(NAME, lambda: _traced(scene, rays), samples=task.rays)
 
 
 def built(task: Casting, level: float) -> Any:
@@ -39,13 +39,9 @@ def built(task: Casting, level: float) -> Any:
 
 def new_level(task: Casting, level: Any) -> Contestant:
     """From `level()` to hits."""
-    rays = _rays(task)
+    rays = task.flat()
     name = f"marching cubes + {NAME}"
-    return Contestant(name, lambda: _traced(built(task, level()), rays), samples=len(task.origins))
-
-
-def _rays(task: Casting) -> tuple[np.ndarray, np.ndarray]:
-    return task.origins.numpy(), task.directions.numpy()
+    return Contestant(name, lambda: _traced(built(task, level()), rays), samples=task.rays)
 
 
 def _traced(scene: Any, rays: tuple[np.ndarray, np.ndarray]) -> Any:

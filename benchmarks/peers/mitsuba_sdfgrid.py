@@ -34,7 +34,7 @@ def casting(task: Casting) -> Contestant:
     drjit = drjit_texture.started(task.threads)
     mitsuba.set_variant("llvm_ad_rgb")
     scene = mitsuba.load_dict({"type": "scene", "surface": _shape(mitsuba, task)})
-    columns = (np.ascontiguousarray(x.numpy().T) for x in (task.origins, task.directions))
+    columns = (np.ascontiguousarray(x.T) for x in task.flat())
     origins, directions = (kind(x) for kind, x in zip((mitsuba.Point3f, mitsuba.Vector3f), columns, strict=True))
     drjit.eval(origins, directions)
 
@@ -44,7 +44,7 @@ def casting(task: Casting) -> Contestant:
         drjit.sync_thread()
         return found
 
-    return Contestant(NAME, call, task.computes, lambda found: task.summary(np.array(found.t)), len(task.origins))
+    return Contestant(NAME, call, task.computes, lambda found: task.summary(np.array(found.t)), task.rays)
 
 
 def _shape(mitsuba: Any, task: Casting) -> dict[str, Any]:

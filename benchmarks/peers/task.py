@@ -39,7 +39,7 @@ class Casting:
     Attributes:
         volume: (n, n, n) float32, samples at the integers.
         level: f = level is hit.
-        origins, directions: (R, 3) float32 voxel coordinates x, y, z.
+        origins, directions: (H, W, 3) float32 voxel coordinates x, y, z, of an image.
         threads: how many it may use.
     """
 
@@ -49,6 +49,15 @@ class Casting:
     directions: Tensor
     threads: int
     computes: str = "trilinear hits"
+
+    @property
+    def rays(self) -> int:
+        """How many there are."""
+        return self.origins.shape[:-1].numel()
+
+    def flat(self) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and directions (R, 3), one after the other."""
+        return self.origins.reshape(-1, 3).numpy(), self.directions.reshape(-1, 3).numpy()
 
     @staticmethod
     def summary(t: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -35,4 +35,4 @@ def new_level(task: Casting, level: Callable[[], float]) -> Contestant:
         contour.Update()
         return contour.GetOutput()
 
-    return Contestant(NAME, call, samples=len(task.origins))
+    return Contestant(NAME, call, samples=task.rays)

@@ -130,10 +130,10 @@ class Field(ABC):
         raise self.no_pieces()
 
     def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
-        """Where rays first meet a level: t (R,) float64 in units of the direction, ∞ where they don't.
+        """Where rays first meet a level: t (...) float64 in units of the direction, ∞ where they don't.
 
         Args:
-            origins, directions: as for `pieces_along`. Not differentiable.
+            origins, directions: as for `pieces_along`, (..., 3). Not differentiable.
 
         Raises:
             TypeError, ValueError: as `pieces_along` does.

@@ -26,6 +26,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from filterlab.ops.march import Bricks
+from filterlab.ops.reference.bounds import over_windows
 from filterlab.ops.stencil import Lowered, Stencil, Table
 from filterlab.render.transfer import TransferFunction
 
@@ -107,21 +108,12 @@ def _volume(coefficients: Tensor, supports: tuple[int, int, int], edge: int) -> 
 
 
 def _ranges(grid: Tensor, supports: tuple[int, int, int], edge: int) -> tuple[Tensor, Tensor]:
+    """Every brick reads B coefficients along an axis, and S − 1 that the next one reads too."""
     low = high = grid
-    for dim, support in zip((2, 1, 0), supports, strict=True):
-        low, high = _windows(low, dim, support, edge).amin(-1), _windows(high, dim, support, edge).amax(-1)
+    for dim, support in enumerate(reversed(supports)):
+        asked = dim, 1 << edge, support - 1
+        low, high = over_windows(torch.amin, low, *asked), over_windows(torch.amax, high, *asked)
     return low.double(), high.double()
-
-
-def _windows(grid: Tensor, dim: int, support: int, edge: int) -> Tensor:
-    """Along one axis the B + S − 1 coefficients that every brick reads, as a last axis; the last one goes on."""
-    size, width = grid.shape[dim], (1 << edge) + support - 1
-    bricks = -(-(size - support + 1) // (1 << edge))
-    more = (bricks << edge) + support - 1 - size
-    if more:
-        shape = [more if axis == dim else n for axis, n in enumerate(grid.shape)]
-        grid = torch.cat((grid, grid.narrow(dim, size - 1, 1).expand(shape)), dim)
-    return grid.unfold(dim, width, 1 << edge)
 
 
 # --- values and opacities -------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -105,7 +105,7 @@ class Surface(ABC):
 
     @abstractmethod
     def _first(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """t (R,) of the first hit of rays (R, 3), ∞ where none."""
+        """t (...) of the first hit of rays (..., 3), ∞ where none."""
 
     @abstractmethod
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
@@ -125,12 +125,12 @@ class Surface(ABC):
             TypeError, ValueError: no such rays: another type or shape, numbers that are not finite, no direction.
         """
         origins, directions = check_rays(origins, directions)
-        t = _by_ray(self.detached._first, origins, directions)
+        t = self._searched(origins, directions)
         return Hits(self._attached(t, origins, directions))
 
     def met(self, origins: Tensor, directions: Tensor) -> Tensor:
         """Whether rays hit it at all, (...) bool; arguments and errors as for `hit`. Nothing is recorded."""
-        return _by_ray(self.detached._first, *check_rays(origins, directions)) < torch.inf
+        return self._searched(*check_rays(origins, directions)) < torch.inf
 
     def hits(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool = False) -> Hits:
         """The first `sheets` hits of every ray in order; the last ones, from the last on, where `farthest`.
@@ -147,7 +147,9 @@ class Surface(ABC):
         """
         check_sheets(sheets)
         origins, directions = check_rays(origins, directions)
-        t = _by_ray(lambda o, d: self.detached._sheets(o, d, sheets, farthest), origins, directions)
+        o, d = (x.detach().reshape(-1, 3) for x in (origins, directions))
+        t = self.detached._sheets(o, d, sheets, farthest).detach()
+        t = t.reshape(*origins.shape[:-1], sheets).to(origins.dtype)
         return Hits(self._attached(t, origins[..., None, :], directions[..., None, :]))
 
     def at(self, origins: Tensor, directions: Tensor, hit: Hits, order: int = 1) -> SurfacePoints:
@@ -177,6 +179,10 @@ class Surface(ABC):
         point = self._polished(o, d, t[:, 0])
         rows = _geometry(point, self.jet(point, order)[1:]) if order else SurfacePoints(point)
         return SurfacePoints(*_spread([row for row in rows if row is not None], index, shape))
+
+    def _searched(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """t (...) of first hits in the type of the rays, without derivatives."""
+        return self.detached._first(origins.detach(), directions.detach()).detach().to(origins.dtype)
 
     def _value(self, points: Tensor) -> Tensor:
         return self.jet(points, 0)[0]
@@ -324,12 +330,6 @@ def _broadcast(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 def _all_finite(x: Tensor) -> bool:
     """A finite sum has finite terms; finite terms may have another one."""
     return math.isfinite(float(x.sum())) or bool(x.isfinite().all())
-
-
-def _by_ray(search: Callable[[Tensor, Tensor], Tensor], origins: Tensor, directions: Tensor) -> Tensor:
-    """What a search of flat rays (R, 3) finds, in the shape of the rays and their type."""
-    found = search(origins.detach().reshape(-1, 3), directions.detach().reshape(-1, 3)).detach()
-    return found.reshape(origins.shape[:-1] + found.shape[1:]).to(origins.dtype)
 
 
 def _along(origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -11,8 +13,10 @@ from filterlab.fields.grid import GridField
 from filterlab.kernels import KERNELS
 from filterlab.methods import from_kernel
 from filterlab.ops import cpu
+from filterlab.ops.cpu import machine
+from filterlab.ops.cpu import raycast as vector_code
 from filterlab.ops.differentiable import raycast
-from filterlab.ops.raycast import Raycast, clear_of
+from filterlab.ops.raycast import Raycast, marks_of
 from tests.test_methods import TENSOR_PRODUCTS
 
 AFFINE = [[1.5, 0.2, 0.1, 3.0], [0.0, -0.8, 0.3, -2.0], [0.1, 0.0, 2.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
@@ -70,6 +74,27 @@ def test_every_kernel(name):
     assert_alike(fl.reconstruct(samples(), from_kernel(KERNELS[name]), prefilter=False))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(16, 24), (2, 3, 8, 16), (15, 100), (7, 9), (33, 3), (1, 64), (64, 1), (2, 0, 8)])
+def test_rays_of_an_image_are_hit_as_each_alone(shape, dtype):
+    """In packs of two rows, with places left over at the ends; or of one row, where these would be many."""
+    field = fl.reconstruct(samples(), "triquadratic")
+    o, d = (x.reshape(*shape, 3) for x in rays(field, math.prod(shape), dtype))
+    given = described(field, dtype)
+    together, alone = (raycast.first(given, *x, "cpu") for x in ((o, d), (o.reshape(-1, 3), d.reshape(-1, 3))))
+    assert together.shape == shape
+    assert torch.equal(together.flatten(), alone)
+    assert math.prod(shape) == 0 or 0.2 < (alone < torch.inf).double().mean() < 1
+
+
+def test_images_are_cast_in_packs_of_two_rows():
+    lanes = machine.lanes_of(torch.float32)
+    packs = lambda *shape: vector_code._in_packs(torch.Size(shape), torch.float32)  # noqa: E731
+    assert packs(512, 512) == (512, 512, 512 * 512 // lanes, (lanes // 2).bit_length() - 1)
+    assert packs(33, 3) == (1, 99, -(-99 // lanes), lanes.bit_length() - 1)
+    assert packs(99) == packs(33, 3)
+
+
 @pytest.mark.parametrize("storage", ["float16", "bfloat16", "float32", "int16", "uint8"])
 def test_storage(storage):
     assert_alike(fl.reconstruct(samples(), "triquadratic", storage=storage))
@@ -125,7 +150,7 @@ def test_rays_on_the_last_faces_of_the_domain():
     """Over clear bricks they were led out of the lattice, once: a place on the end is that of no cell."""
     field, o, d = rays_on_the_last_faces()
     given = field._raycast(3.0, o, d)
-    assert (given.clear > 0).any()
+    assert (given.marks < 0).any()
     expected = raycast.first(given, o, d, "reference")
     assert (expected < torch.inf).all()
     assert torch.allclose(raycast.first(given, o, d, "cpu"), expected, rtol=0, atol=1e-12)
@@ -183,9 +208,16 @@ def test_what_cannot_run_is_said_and_runs_plainly(monkeypatch):
 
 def test_clear_bricks_are_as_far_from_the_others_as_is_said():
     g = torch.Generator().manual_seed(0)
-    relevant = torch.rand(21, 6, 47, generator=g) < 0.001
-    clear = clear_of(relevant)
+    parts = torch.rand(41, 11, 94, generator=g) < 0.0002
+    marks = marks_of(parts)
+    assert marks.shape == (21, 6, 47)
+    clear, relevant = (-marks).clamp_min(0), marks > 0
     assert set(clear.unique().tolist()) == set(range(10))
+    for part in torch.randint(0, 1 << 30, (2000, 3), generator=g).remainder(torch.tensor(parts.shape)).tolist():
+        z, y, x = (i % 2 for i in part)
+        mark = int(marks[tuple(i // 2 for i in part)])
+        assert (mark > 0 and bool(mark >> (x + 2 * y + 4 * z) & 1)) == bool(parts[tuple(part)])
+    assert int(sum((marks[relevant] >> k) & 1 for k in range(8)).sum()) == int(parts.sum())
     where = relevant.nonzero()
     for brick in torch.randint(0, 1 << 30, (400, 3), generator=g).remainder(torch.tensor(relevant.shape)):
         distance = int((where - brick).abs().amax(1).min())

@@ -1,7 +1,7 @@
 """Casting rays as vector code: describes lattices and rays to the programs of `ops.cpu.crossings`.
 
-Memory beyond the result: one byte for every brick; for candidates 24 + 1 bytes and n + 1 numbers for every ray and each
-of the `capacity` that there is room for.
+Memory beyond the result: two bytes for every brick; for candidates 24 + 1 bytes and n + 1 numbers for every ray and
+each of the `capacity` that there is room for.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ from filterlab.ops.cpu.memory import ARITHMETIC, has_room
 from filterlab.ops.gather import STORAGE, in_whole_rows
 from filterlab.ops.raycast import Candidates, Raycast, Written, written_in_parts
 
+_WASTED = 17 / 16  # places for rays in packs of two rows, over rays: more would take back most of what is gained
+
 
 def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
-    """`ops.reference.raycast.first`, fused: t (R,) float64 of rays (R, 3), without derivatives."""
-    t = torch.empty(len(origins), dtype=torch.float64)
-    if len(t):
+    """`ops.reference.raycast.first`, fused: t (...) float64 of rays (..., 3), without derivatives."""
+    t = torch.empty(origins.shape[:-1], dtype=torch.float64)
+    if t.numel():
         _Cast(given, "first", origins, directions).run(t=t)
     return t
 
@@ -32,6 +34,8 @@ def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidate
 
     def write(rays: Tensor, capacity: int) -> Written:
         written = Written.room(given, len(rays), capacity)
+        if not len(rays):
+            return written
         cast = _Cast(given, "candidates", origins[rays], directions[rays])
         cast.job.capacity = capacity
         cast.run(**written._asdict())
@@ -44,19 +48,28 @@ class _Cast:
     """A lattice and rays as a job."""
 
     def __init__(self, given: Raycast, asked: str, origins: Tensor, directions: Tensor) -> None:
-        self.dtype, self.rays = given.dtype, len(origins)
         coefficients = in_whole_rows(given.lattice.coefficients)
         self.function = compiler.compiled(_variant(given, asked, coefficients))
         self.job = _job(given, coefficients)
-        self.job.rays = self.rays
+        self.job.rows, self.job.columns, self.job.packs, self.job.wide = _in_packs(origins.shape[:-1], given.dtype)
         self.job.point(origins=origins.to(given.dtype).contiguous(), directions=directions.to(given.dtype).contiguous())
 
     def run(self, **results: Tensor) -> None:
         job = self.job
         job.point(**results)
-        packs = -(-self.rays // lanes_of(self.dtype))
-        job.next, job.chunks = 0, -(-packs // PACKS_OF_A_CHUNK)
+        job.next, job.chunks = 0, -(-job.packs // PACKS_OF_A_CHUNK)
         pool.run(self.function, [job] * max(1, min(torch.get_num_threads(), job.chunks)))
+
+
+def _in_packs(shape: torch.Size, dtype: torch.dtype) -> tuple[int, int, int, int]:
+    """Rows, columns, packs of rays of a shape, and log₂ of a pack's width: see `ops.cpu.crossings`."""
+    rays, lanes = shape.numel(), lanes_of(dtype)
+    columns = shape[-1] if shape else 1
+    rows, wide = rays // columns, lanes // 2
+    packs = -(-rows // 2) * -(-columns // wide)
+    if packs * lanes > _WASTED * rays:
+        rows, columns, wide, packs = 1, rays, lanes, -(-rays // lanes)
+    return rows, columns, packs, wide.bit_length() - 1
 
 
 def _variant(given: Raycast, asked: str, coefficients: Tensor) -> RaycastVariant:
@@ -83,7 +96,7 @@ def _job(given: Raycast, coefficients: Tensor) -> RaycastJob:
         shift=lattice.shift - given.level,
         edge=given.edge.bit_length() - 1,
     )
-    for axis, cells, bricks in zip(AXES, lattice.cells, given.clear.shape[::-1], strict=True):
+    for axis, cells, bricks in zip(AXES, lattice.cells, given.marks.shape[::-1], strict=True):
         setattr(job, f"cells_{axis}", cells)
         setattr(job, f"bricks_{axis}", bricks)
     numbers = {
@@ -94,5 +107,5 @@ def _job(given: Raycast, coefficients: Tensor) -> RaycastJob:
         "upper": lattice.upper,
     }
     arrays = {name: torch.tensor(x, dtype=torch.float64) for name, x in numbers.items()}
-    job.point(coefficients=coefficients, clear=given.clear.contiguous(), **arrays)
+    job.point(coefficients=coefficients, marks=given.marks.contiguous(), **arrays)
     return job

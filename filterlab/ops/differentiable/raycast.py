@@ -19,15 +19,16 @@ def missing(given: Raycast, origins: Tensor) -> str | None:
     room = cuda if _implementation_for(given) == "cuda" else cpu
     if problem := room.missing(given.lattice.coefficients.detach()[None, None], points, given.lattice.stencil):
         return problem
-    if given.clear.numel() >= 1 << 31:
-        return f"up to {1 << 31} bricks; got {given.clear.numel()}"
+    if given.marks.numel() >= 1 << 31:
+        return f"up to {1 << 31} bricks; got {given.marks.numel()}"
     return None
 
 
 def first(given: Raycast, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Tensor:
-    """t (R,) float64, where rays (R, 3) first meet the level; ∞ where they don't. Without derivatives.
+    """t (...) float64, where rays (..., 3) first meet the level; ∞ where they don't. Without derivatives.
 
     Args:
+        origins, directions: those that lie near each other along the last two axes of an image are cast together.
         implementation: "reference", "cpu" or "cuda"; None: the fastest that can run.
     """
     return _driver(given, origins, implementation).first(given, origins, directions)

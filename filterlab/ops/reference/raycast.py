@@ -24,7 +24,7 @@ Search = Callable[[Tensor, Tensor], Candidates]
 
 
 def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
-    """t (R,) float64, where rays (R, 3) first meet the level; ∞ where they don't."""
+    """t (...) float64, where rays (..., 3) first meet the level; ∞ where they don't."""
     return first_of(_found(given), origins, directions, sum(given.lattice.cells))
 
 
@@ -41,17 +41,18 @@ def _pieces(given: Raycast, origins: Tensor, directions: Tensor) -> Pieces:
     """The pieces of rays (R, 3) in bricks that may hold the level."""
     lattice = given.lattice
     own = in_cells(origins, directions, given.geometry, lattice)
-    return pieces_of_rays(own, lattice, given.dtype, given.edge, given.clear == 0)
+    return pieces_of_rays(own, lattice, given.dtype, given.edge, given.marks > 0)
 
 
 def first_of(search: Search, origins: Tensor, directions: Tensor, most: int) -> Tensor:
-    """t (R,) of the first crossing among what a search finds, ∞ where none; `most` pieces, about, has a ray."""
+    """t (...) of the first crossing among what a search finds, ∞ where none; `most` pieces, about, has a ray."""
+    shape, origins, directions = origins.shape[:-1], origins.reshape(-1, 3), directions.reshape(-1, 3)
     t = origins.new_full((len(origins),), math.inf, dtype=torch.float64)
     for part in _parts(len(origins), most):
         found = search(origins[part], directions[part])
         within = torch.where(found.jump, 0, first_root(found.coefficients))
         t[part] = t[part].scatter_reduce(0, found.ray, found.t(within), "amin")
-    return t
+    return t.reshape(shape)
 
 
 def all_of(search: Search, origins: Tensor, directions: Tensor, most: int) -> Candidates:
