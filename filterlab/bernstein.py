@@ -121,9 +121,18 @@ def _step(coefficients: Tensor, weights: Tensor, degree: int) -> Tensor:
     return sum(terms[1:], terms[0]).movedim(0, -1)
 
 
-@lru_cache
+_RAISED: dict[tuple[int, int], tuple[list[int], ...]] = {}
+"""What `_raised_tables` found; kept here, since of `lru_cache` torch.compile warns."""
+
+
 def _raised_tables(degree: int, dimension: int) -> tuple[list[int], ...]:
     """For every k the places of β + e_k, |β| = degree − 1."""
+    if (degree, dimension) not in _RAISED:
+        _RAISED[degree, dimension] = _made_raised_tables(degree, dimension)
+    return _RAISED[degree, dimension]
+
+
+def _made_raised_tables(degree: int, dimension: int) -> tuple[list[int], ...]:
     place = {alpha: i for i, alpha in enumerate(multi_indices(degree, dimension))}
     lower = multi_indices(degree - 1, dimension)
     return tuple([place[_plus(beta, k)] for beta in lower] for k in range(dimension + 1))

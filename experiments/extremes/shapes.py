@@ -176,7 +176,8 @@ CASES = (
     Case(
         "small-axes",
         "axes of one and two voxels",
-        "Every sample is interpolated where the method does; constant along one voxel but for octahedra (under zeros: 0 outside).",
+        "Every sample is interpolated where the method does; constant along one voxel but for octahedra (under zeros: "
+        "0 outside).",
         small_axes,
         SWEEP,
         0.1,

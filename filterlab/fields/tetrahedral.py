@@ -142,6 +142,8 @@ class Tables:
     """A spline as tensors.
 
     Attributes:
+        axes: (3, 8), the cone's axes in space's, for every outcome of `_outcome`; ranks: space's in the cone's.
+        pairs: (9,), of a pair of axes, 3 i + j, the row of a Hessian's xx, xy, xz, yy, yz, zz.
         barycentric: (S, 4, 4), see `Shape.barycentric`.
         masks: (R, K), those that differ, in the order of `Spline.samples`.
         rows: (B, S), which of them a shape's coefficients are, in the order of `multi_indices`.
@@ -152,6 +154,9 @@ class Tables:
         which: for each axis of the cone (K,), which of these every sample has.
     """
 
+    axes: Tensor
+    ranks: Tensor
+    pairs: Tensor
     barycentric: Tensor
     masks: Tensor
     rows: Tensor
@@ -167,7 +172,11 @@ class Tables:
         rows = [[distinct.setdefault(s.row(a, spline.samples), len(distinct)) for s in spline.shapes] for a in indices]
         barycentric = np.array([shape.barycentric for shape in spline.shapes], dtype=np.float64)
         along = [sorted({o[axis] for o in spline.samples}) for axis in range(3)]
+        orders = torch.tensor(_orders()).T
         return cls(
+            orders,
+            orders.argsort(0),
+            torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5]),
             torch.tensor(barycentric),
             torch.tensor(list(distinct), dtype=torch.float64),
             torch.tensor(rows),
@@ -182,6 +191,9 @@ class Tables:
             return tuple(t.to(device) for t in tensors)
 
         return Tables(
+            self.axes.to(device),
+            self.ranks.to(device),
+            self.pairs.to(device),
             self.barycentric.to(device),
             self.masks.to(device),
             self.rows.to(device),
@@ -190,6 +202,15 @@ class Tables:
             moved(self.behind),
             moved(self.which),
         )
+
+
+def _orders() -> list[tuple[int, int, int]]:
+    """The axes by decreasing |coordinate|, for every `_outcome`; for what cannot be as they are."""
+    rows = [(0, 1, 2)] * 8
+    for x, y, z in product(range(3), repeat=3):
+        order = sorted(range(3), key=lambda axis: (-(x, y, z)[axis], axis))
+        rows[4 * (x < y) + 2 * (y < z) + (x < z)] = (order[0], order[1], order[2])
+    return rows
 
 
 def _derivative_rows(barycentric: np.ndarray, degree: int, order: int) -> np.ndarray:
@@ -207,19 +228,9 @@ def _derivative_rows(barycentric: np.ndarray, degree: int, order: int) -> np.nda
 # --- where points are -------------------------------------------------------------------------------------------------
 
 
-def _orders() -> list[tuple[int, int, int]]:
-    """The axes by decreasing |coordinate|, for every outcome of x < y, y < z, x < z (4, 2, 1): one number each."""
-    rows = [(0, 1, 2)] * 8
-    for x, y, z in product(range(3), repeat=3):
-        order = sorted(range(3), key=lambda axis: (-(x, y, z)[axis], axis))
-        rows[4 * (x < y) + 2 * (y < z) + (x < z)] = (order[0], order[1], order[2])
-    return rows
-
-
-_ORDERS = torch.tensor(_orders()).T  # (3, 8): the cone's axes in space's
-_RANKS = _ORDERS.argsort(0)  # space's axes in the cone's
-_ROW_OF_PAIR = torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5])
-"""Of a pair of axes, 3 i + j, the row of a Hessian's xx, xy, xz, yy, yz, zz."""
+def _outcome(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Of comparing |coordinates|: 4 for x < y, 2 for y < z, 1 for x < z."""
+    return 4 * (x < y).long() + 2 * (y < z) + (x < z)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,9 +257,8 @@ def locate(spline: Spline, tables: Tables, voxels: Tensor, dtype: torch.dtype) -
     """Where voxel coordinates (P, 3) are; local coordinates are taken in their type, and all others in `dtype`."""
     cell = spline.cells(voxels.detach())
     local = (voxels - (cell + float(spline.shift))).to(dtype).T
-    x, y, z = local.abs()
-    outcome = 4 * (x < y).long() + 2 * (y < z) + (x < z)
-    axes, ranks = (t.to(local.device).index_select(1, outcome) for t in (_ORDERS, _RANKS))
+    outcome = _outcome(*local.abs())
+    axes, ranks = tables.axes.index_select(1, outcome), tables.ranks.index_select(1, outcome)
     sign = torch.where(local < 0, -1, 1).to(dtype)
     a, b, c = (local * sign).gather(0, axes)
     m = tables.barycentric.to(dtype)[..., None]
@@ -430,7 +440,8 @@ class JetOnTetrahedra:
         for order in range(min(self.order, degree), -1, -1):
             steps = bernstein.degree_of(pieces, 3) - order
             pieces = bernstein.blossom(pieces, [weights] * steps)
-            rows.append(_turned(self._derivatives(order, pieces.movedim(-1, 1), at), at, order))
+            along_cone = self._derivatives(order, pieces.movedim(-1, 1), at)
+            rows.append(_turned(along_cone, at, order, self.tables.pairs))
         return rows[::-1]
 
 
@@ -443,7 +454,7 @@ def _product(matrix: Tensor, columns: Tensor) -> Tensor:
     return total
 
 
-def _turned(rows: Tensor, at: Located, order: int) -> Tensor:
+def _turned(rows: Tensor, at: Located, order: int, row_of_pair: Tensor) -> Tensor:
     """Derivatives (C, J, P) of an order along the axes of the cone, along those of space."""
     if order == 0:
         return rows
@@ -451,5 +462,5 @@ def _turned(rows: Tensor, at: Located, order: int) -> Tensor:
         return rows.gather(1, at.ranks.expand(rows.shape)) * at.sign
     pairs = [(i, j) for i in range(3) for j in range(i, 3)]
     place = torch.stack([3 * at.ranks[i] + at.ranks[j] for i, j in pairs])
-    row = _ROW_OF_PAIR.to(rows.device).index_select(0, place.reshape(-1)).reshape(place.shape)
+    row = row_of_pair.index_select(0, place.reshape(-1)).reshape(place.shape)
     return rows.gather(1, row.expand(rows.shape)) * torch.stack([at.sign[i] * at.sign[j] for i, j in pairs])
