@@ -21,7 +21,6 @@ from filterlab.fields.grid import Coefficients, GridField, Scheme, Term, impleme
 from filterlab.fields.ncrsi import NCRSI_TERMS, SevenSamples
 from filterlab.fields.octahedral import QUADRATIC_C1
 from filterlab.fields.storage import named_storage
-from filterlab.fields.tetrahedral_pieces import FieldOnTetrahedra
 from filterlab.fields.tensor_product import (
     Direct,
     EightTrilinearCubic,
@@ -32,6 +31,7 @@ from filterlab.fields.tensor_product import (
     same_kernel,
 )
 from filterlab.fields.tetrahedral import OnTetrahedra, Spline
+from filterlab.fields.tetrahedral_pieces import FieldOnTetrahedra
 from filterlab.fields.type6 import CUBIC_C1, QSS
 from filterlab.kernels import Kernel, PiecewisePolynomial, TensorKernel
 from filterlab.ops.differentiable import gather

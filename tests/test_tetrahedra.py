@@ -16,7 +16,6 @@ from filterlab.fields.tetrahedral import Shape, Spline
 from filterlab.fields.type6 import CUBIC_C1, QSS
 from filterlab.methods import METHODS, Tetrahedral
 from filterlab.render import PerspectiveCamera, TransferFunction
-from filterlab.surfaces import LevelSet
 from tests import laws, tetrahedral_oracle
 
 SPLINES = [name for name, method in METHODS.items() if isinstance(method, Tetrahedral)]
@@ -150,10 +149,6 @@ def test_resampling_is_pointwise(name):
 
 @every_spline
 def test_what_is_lacking_is_said(name):
-    field = fl.reconstruct(samples(), name)
-    assert field.degree_along_rays is field.search is None
-    with pytest.raises(TypeError, match=f"{name}: pieces are found on the grid's cells only"):
-        LevelSet(field, 0.1)
     with pytest.raises(TypeError, match="measured only"):
         fl.spectrum.axis_response(name, torch.zeros(1))
     with pytest.raises(ValueError, match="offers the schemes direct; got 'fused'"):

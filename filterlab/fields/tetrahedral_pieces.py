@@ -1,11 +1,11 @@
 """Pieces along rays of splines on tetrahedra, and which of their tetrahedra may hold a level; in plain torch.
 
-    ray ─▶ planes that bound cells ─▶ cells that may hold the level ─▶ planes through their centres ─▶ one tetrahedron each
+    ray ─▶ planes between cells ─▶ cells that may hold the level ─▶ planes through their centres ─▶ one tetrahedron each
 
 Every face of a tetrahedron lies in a plane n · x = k + offset that bounds cells, or n · (x − centre) = 0. The signed
 permutations of a shape's faces give all normals n, primitive vectors of integers; that some planes go on where no
-tetrahedron has a face there only cuts a piece in two. A piece is in the tetrahedron around its middle; its polynomial is
-the blossom at both of its ends (`bernstein.restrict`), of the degree of the spline.
+tetrahedron has a face there only cuts a piece in two. A piece is in the tetrahedron around its middle; its polynomial
+is the blossom at both of its ends (`bernstein.restrict`), of the degree of the spline.
 
 Source: Kalbe and Zeilfelder 2008, section 5, and the walk through planes instead of projected tetrahedra.
 """
@@ -122,18 +122,19 @@ class FieldOnTetrahedra(GridField):
         own = geometry.to_voxel(origins.detach().double()), geometry.direction_to_voxel(directions.detach().double())
         x, y, z = (n - 0.5 for n in self.coefficients.size)
         lines, ray, start = inside(*own, (-0.5, -0.5, -0.5), (x, y, z))
-        line, near, far = _cut(lines, torch.arange(len(ray), device=ray.device), lines.near, lines.far, *self._outer(lines))
+        every = torch.arange(len(ray), device=ray.device)
+        line, near, far = _cut(every, lines.near, lines.far, self._outer(lines))
         cells = self._cells(lines, line, near, far)
         if level is not None:
             keep = self._may_hold(cells, level, dtype)
             line, near, far, cells = (x[keep] for x in (line, near, far, cells))
-        line, near, far = _cut(lines, line, near, far, *self._inner(lines, line, cells))
+        line, near, far = _cut(line, near, far, self._inner(lines, line, cells))
         coefficients = self._restricted(lines, line, near, far, dtype)
         return Pieces(ray[line], near, far, _joined(coefficients, line, near, far), start)
 
     # --- where a ray passes from one polynomial into another ---
 
-    def _outer(self, lines: Lines) -> tuple[Tensor]:
+    def _outer(self, lines: Lines) -> Tensor:
         """Where lines (L) pass planes that bound cells, (L, K); beyond their ends where there are fewer."""
         found = []
         for normal, offset in self._planes.outer:
@@ -145,14 +146,14 @@ class FieldOnTetrahedra(GridField):
             k = first[:, None] + torch.arange(max(count, 0), device=first.device)
             s = (k - place[:, None]) / torch.where(speed == 0, 1, speed)[:, None]
             found.append(torch.where((k <= last[:, None]) & (speed != 0)[:, None], s, torch.inf))
-        return (torch.cat(found, 1),)
+        return torch.cat(found, 1)
 
-    def _inner(self, lines: Lines, line: Tensor, cells: Tensor) -> tuple[Tensor]:
+    def _inner(self, lines: Lines, line: Tensor, cells: Tensor) -> Tensor:
         """Where they pass planes through the centres of cells (P, 3), (P, M)."""
         normals = lines.origins.new_tensor(self._planes.inner).T
         place = (lines.origins[line] - (cells + float(self.scheme.spline.shift))) @ normals
         speed = (lines.directions @ normals)[line]
-        return (torch.where(speed == 0, torch.inf, -place / torch.where(speed == 0, 1, speed)),)
+        return torch.where(speed == 0, torch.inf, -place / torch.where(speed == 0, 1, speed))
 
     def _cells(self, lines: Lines, line: Tensor, near: Tensor, far: Tensor) -> Tensor:
         """(P, 3), the cell around the middle of every piece."""
@@ -268,9 +269,7 @@ def _placed(cells: Tensor, shape: int, axes: tuple[int, ...], signs: tuple[int, 
     )
 
 
-def _cut(
-    lines: Lines, line: Tensor, near: Tensor, far: Tensor, events: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _cut(line: Tensor, near: Tensor, far: Tensor, events: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pieces of lines (P), cut at events (P, K) that lie in them: (line, near, far) of those of any length."""
     inner = torch.minimum(torch.maximum(events, near[:, None]), far[:, None]).sort(1)[0]
     ends = torch.cat((near[:, None], inner, far[:, None]), 1)
