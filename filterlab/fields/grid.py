@@ -307,7 +307,7 @@ class GridField(Field):
         if level is None or not lattice.continuous:  # a jump may lie between bricks that hold no level
             return pieces_of_rays(rays, lattice, dtype)
         bounds = ranges(lattice)
-        return pieces_of_rays(rays, lattice, dtype, bounds.edge, bounds.may_hold(level, dtype))
+        return pieces_of_rays(rays, lattice, dtype, bounds.edge // 2, bounds.may_hold(level, dtype))
 
     def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
         return casting.first(self._raycast(level, origins, directions), origins, directions, self._caster)
@@ -320,7 +320,7 @@ class GridField(Field):
         dtype = type_of_rays(origins, directions)
         lattice = self.lattice
         bounds = ranges(lattice)
-        return Raycast(lattice, self.domain.geometry, level, dtype, bounds.clear(level, dtype), bounds.edge)
+        return Raycast(lattice, self.domain.geometry, level, dtype, bounds.marks(level, dtype), bounds.edge)
 
     @property
     def _caster(self) -> str | None:

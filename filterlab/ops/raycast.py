@@ -120,21 +120,33 @@ class Raycast:
         geometry: where it lies in the world; coordinates of cells are those of voxels − lattice.offset.
         level: f = level is what is hit.
         dtype: of the rays and of polynomials, float32 or float64.
-        clear: (bz, by, bx) uint8, of bricks of `edge`³ cells: 0 where the brick may hold the level, else 1 + r, where
-            no brick within r of it, along every axis, does.
-        edge: cells along an edge of a brick, a power of two.
+        marks: (bz, by, bx) int16, of bricks of `edge`³ cells. Positive where the brick may hold the level: bit
+            x + 2 y + 4 z tells whether its part there does, of two along every axis. Else −1 − r, where no brick within
+            r of it, along every axis, may hold it.
+        edge: cells along an edge of a brick, a power of two from 2 on.
     """
 
     lattice: Lattice
     geometry: Geometry
     level: float
     dtype: torch.dtype
-    clear: Tensor
+    marks: Tensor
     edge: int
 
 
-def clear_of(relevant: Tensor) -> Tensor:
-    """`Raycast.clear` from (bz, by, bx) which bricks may hold the level, for r of `_RADII`."""
+def marks_of(parts: Tensor) -> Tensor:
+    """`Raycast.marks` from (pz, py, px) which parts may hold the level."""
+    whole = [n + n % 2 for n in parts.shape]
+    pad = [k for n, own in zip(reversed(whole), reversed(parts.shape), strict=True) for k in (0, n - own)]
+    bits = torch.nn.functional.pad(parts.to(torch.uint8), pad)
+    for dim, shift in ((0, 4), (1, 2), (2, 1)):  # the last in memory when least is left
+        first, second = bits.unflatten(dim, (-1, 2)).unbind(dim + 1)
+        bits = first | (second << shift)
+    return torch.where(bits > 0, bits.to(torch.int16), -_clear_of(bits > 0).to(torch.int16))
+
+
+def _clear_of(relevant: Tensor) -> Tensor:
+    """(bz, by, bx) uint8: 0 for bricks that may hold the level, else 1 + r as in `Raycast.marks`, for r of `_RADII`."""
     near = relevant.to(torch.uint8)
     clear, reach = 1 - near, 0
     for radius in _RADII:  # within 2 k is within k of what is within k

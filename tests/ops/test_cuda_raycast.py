@@ -25,7 +25,7 @@ FEW, MANY = 33, 20_000  # the interpreter takes 50 ms for a ray; 33 are more tha
 
 def on(device: str, given: Raycast) -> Raycast:
     lattice = replace(given.lattice, coefficients=given.lattice.coefficients.to(device))
-    return replace(given, lattice=lattice, clear=given.clear.to(device))
+    return replace(given, lattice=lattice, marks=given.marks.to(device))
 
 
 def cast(field: GridField, device: str, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
@@ -137,7 +137,7 @@ def test_compiles_for_a_gpu_that_need_not_be_there(monkeypatch: pytest.MonkeyPat
         variant = crossings.RaycastVariant(asked, lattice.stencil.lowered, 3, lattice.continuous, "float32")
         types = dict.fromkeys(("coefficients", "origins", "directions", "pieces"), "*fp32")
         types |= dict.fromkeys(("numbers", "t", "places"), "*fp64")
-        types |= {"clear": "*u8", "flags": "*u8", "count": "*i64", "BLOCK": "constexpr"}
+        types |= {"marks": "*i16", "flags": "*u8", "count": "*i64", "BLOCK": "constexpr"}
         written = launch.launchable(variant.write())
         source = ASTSource(written, {p.name: types.get(p.name, "i32") for p in written.params}, {"BLOCK": cuda.BLOCK})
         made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})

@@ -16,7 +16,7 @@ from filterlab.ops import cpu
 from filterlab.ops.cpu import machine
 from filterlab.ops.cpu import raycast as vector_code
 from filterlab.ops.differentiable import raycast
-from filterlab.ops.raycast import Raycast, clear_of
+from filterlab.ops.raycast import Raycast, marks_of
 
 AFFINE = [[1.5, 0.2, 0.1, 3.0], [0.0, -0.8, 0.3, -2.0], [0.1, 0.0, 2.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
 LEVEL = 0.5
@@ -149,7 +149,7 @@ def test_rays_on_the_last_faces_of_the_domain():
     """Over clear bricks they were led out of the lattice, once: a place on the end is that of no cell."""
     field, o, d = rays_on_the_last_faces()
     given = field._raycast(3.0, o, d)
-    assert (given.clear > 0).any()
+    assert (given.marks < 0).any()
     expected = raycast.first(given, o, d, "reference")
     assert (expected < torch.inf).all()
     assert torch.allclose(raycast.first(given, o, d, "cpu"), expected, rtol=0, atol=1e-12)
@@ -207,9 +207,16 @@ def test_what_cannot_run_is_said_and_runs_plainly(monkeypatch):
 
 def test_clear_bricks_are_as_far_from_the_others_as_is_said():
     g = torch.Generator().manual_seed(0)
-    relevant = torch.rand(21, 6, 47, generator=g) < 0.001
-    clear = clear_of(relevant)
+    parts = torch.rand(41, 11, 94, generator=g) < 0.0002
+    marks = marks_of(parts)
+    assert marks.shape == (21, 6, 47)
+    clear, relevant = (-marks).clamp_min(0), marks > 0
     assert set(clear.unique().tolist()) == set(range(10))
+    for part in torch.randint(0, 1 << 30, (2000, 3), generator=g).remainder(torch.tensor(parts.shape)).tolist():
+        z, y, x = (i % 2 for i in part)
+        mark = int(marks[tuple(i // 2 for i in part)])
+        assert (mark > 0 and bool(mark >> (x + 2 * y + 4 * z) & 1)) == bool(parts[tuple(part)])
+    assert int(sum((marks[relevant] >> k) & 1 for k in range(8)).sum()) == int(parts.sum())
     where = relevant.nonzero()
     for brick in torch.randint(0, 1 << 30, (400, 3), generator=g).remainder(torch.tensor(relevant.shape)):
         distance = int((where - brick).abs().amax(1).min())

@@ -1,9 +1,9 @@
 """The way of rays through the cells of a lattice, a pack of rays at a time; what surely holds nothing is leapt over.
 
-Every ray has a cell and a place s. Its next cell is behind the nearest of three planes, those of its cell or, in a
-brick whose bounds leave out the level, those of the cube of clear bricks around it (`ops.raycast.clear_of`). Where a
-ray crosses a plane is (plane − o) / d, whoever asks, so that neighbours share their ends to the bit; through edges and
-corners cells follow one another by faces, some of them over no length.
+Every ray has a cell and a place s. Its next cell is behind the nearest of three planes: those of its cell; in a part
+of a brick whose bounds leave out the level, those of the part; in such a brick, those of the cube of clear ones around
+it (`ops.raycast.Raycast.marks`). Where a ray crosses a plane is (plane − o) / d, whoever asks, so that neighbours share
+their ends to the bit; through edges and corners cells follow one another by faces, some of them over no length.
 
 Places are doubles, whatever polynomials are computed in. A ray is measured from where it enters the domain, and its
 direction scaled by a power of two to a length about 1. Who has found a cell that may hold the level waits for the
@@ -20,7 +20,7 @@ from types import SimpleNamespace
 from llvmlite import ir
 
 from filterlab.ops.cpu.job import AXES
-from filterlab.ops.cpu.lanes import DOUBLE, I8, I32, I64, Lanes, Value, Variable
+from filterlab.ops.cpu.lanes import DOUBLE, I16, I32, I64, Lanes, Value, Variable
 from filterlab.ops.pieces import NO_MOTION
 
 _EXPONENT = 0x7FF << 52
@@ -161,11 +161,11 @@ class Walk:
         e, b = self.lanes, self.builder
         searching = b.and_(self.going.value, b.not_(waiting))
         on, found = e.variable(self._wide(searching)), e.variable(self._integers(0))
-        clear = e.variable(self._integers(0))
-        self._look(on, found, clear)
+        mark = e.variable(self._integers(0))
+        self._look(on, found, mark)
         with e.repeat_while(lambda: e.any(self._narrow(on.value))):
-            self._leap(on, clear.value)
-            self._look(on, found, clear)
+            self._leap(on, mark.value)
+            self._look(on, found, mark)
         mask = self._narrow(found.value)
         cell = [b.select(mask, c.value, self._integers(0)) for c in self._cell]  # taps are read in every lane
         ahead = [b.add(c, self._sign(f, 0)) for c, f in zip(cell, self._backward, strict=True)]
@@ -182,22 +182,30 @@ class Walk:
         self.going.value = b.and_(self.going.value, b.not_(b.and_(mask, b.or_(over, outside))))
         return Found(mask, cell, near, e.minimum(far, end))
 
-    def _look(self, on: Variable, found: Variable, clear: Variable) -> None:
-        """Whoever is in a brick that may hold the level has found its cell."""
-        b = self.builder
+    def _look(self, on: Variable, found: Variable, mark: Variable) -> None:
+        """Whoever is in a part of a brick that may hold the level has found its cell."""
+        b, one = self.builder, self._integers(1)
         edge = self._whole(self.job.edge)
-        clear.value = seen = self._clear([b.lshr(c.value, edge) for c in self._cell])
-        holds = b.and_(on.value, self._wide(b.icmp_signed("==", seen, self._integers(0))))
+        cell = [c.value for c in self._cell]
+        mark.value = seen = self._marks([b.lshr(c, edge) for c in cell])
+        half = b.sub(edge, one)
+        part = self._integers(0)
+        for i, c in enumerate(cell):
+            part = b.or_(part, b.shl(b.and_(b.lshr(c, half), one), self._integers(i)))
+        bit = b.and_(b.lshr(self._larger(seen, self._integers(0)), part), one)
+        holds = b.and_(on.value, b.sub(self._integers(0), bit))
         found.value = b.or_(found.value, holds)
         on.value = b.xor(on.value, holds)
 
-    def _leap(self, on: Variable, clear: Value) -> None:
-        """Over the clear bricks around."""
+    def _leap(self, on: Variable, mark: Value) -> None:
+        """Over the clear bricks around, or the clear part of a brick."""
         e, b = self.lanes, self.builder
         moves = self._narrow(on.value)
-        edge, radius = self._whole(self.job.edge), b.sub(clear, self._integers(1))
+        is_clear = b.ashr(mark, self._integers(31))  # −1 where the whole brick is, else 0
+        edge = b.sub(b.sub(self._whole(self.job.edge), self._integers(1)), is_clear)
+        radius = b.and_(b.not_(mark), is_clear)
         cell = [c.value for c in self._cell]
-        brick = [b.lshr(c, edge) for c in cell]
+        brick = [b.lshr(c, edge) for c in cell]  # or the part, as a brick of half the edge
         plane = [b.shl(b.add(x, self._sign(f, radius)), edge) for x, f in zip(brick, self._backward, strict=True)]
         crossed = self._crossed(plane)
         before = self._s.value
@@ -206,7 +214,7 @@ class Walk:
         for i, through in enumerate(self._through(crossed)):
             at = e.to_integer(e.multiply_add(reached, self.direction[i].value, self.entry[i].value))
             low = b.shl(b.sub(brick[i], radius), edge)
-            high = b.sub(b.shl(b.add(brick[i], clear), edge), self._integers(1))
+            high = b.sub(b.shl(b.add(b.add(brick[i], radius), self._integers(1)), edge), self._integers(1))
             at = self._smaller(self._larger(at, low), self._smaller(high, self._last(i)))  # also on the domain's end
             cells.append(b.select(through, b.add(plane[i], self._backward[i].value), at))
             self._cell[i].value = b.select(moves, cells[i], cell[i])
@@ -257,16 +265,16 @@ class Walk:
     def _narrow(self, mask: Value) -> Value:
         return self.builder.icmp_signed("<", mask, self._integers(0))
 
-    def _clear(self, brick: Sequence[Value]) -> Value:
-        """`Raycast.clear` of bricks; whatever, but in memory, beyond the lattice."""
+    def _marks(self, brick: Sequence[Value]) -> Value:
+        """`Raycast.marks` of bricks; whatever, but in memory, beyond the lattice."""
         e, b, j = self.lanes, self.builder, self.job
         x, y, z = brick
         bx, by, bz = (self._whole(n) for n in (j.bricks_x, j.bricks_y, j.bricks_z))
         last = b.sub(b.mul(b.mul(bz, by), bx), self._integers(1))
         index = b.add(b.mul(b.add(b.mul(z, by), y), bx), x)
         index = b.select(b.icmp_unsigned("<", index, last), index, last)
-        found = ir.Constant(ir.VectorType(I8, e.count), [0] * e.count)
+        found = ir.Constant(ir.VectorType(I16, e.count), [0] * e.count)
         for lane in range(e.count):
             place = b.zext(b.extract_element(index, I32(lane)), I64)
-            found = b.insert_element(found, b.load(e.advance(j.clear, place, I8), typ=I8), I32(lane))
-        return b.zext(found, self.integers)
+            found = b.insert_element(found, b.load(e.advance(j.marks, place, I16), typ=I16), I32(lane))
+        return b.sext(found, self.integers)

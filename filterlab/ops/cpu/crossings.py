@@ -54,7 +54,7 @@ FIELDS: dict[str, type] = {
     "upper": ctypes.c_void_p,  # (3) d
     "scale": ctypes.c_double,  # f − level is scale · sum + shift
     "shift": ctypes.c_double,
-    "clear": ctypes.c_void_p,  # (bz, by, bx) bytes, see `ops.raycast.Raycast`
+    "marks": ctypes.c_void_p,  # (bz, by, bx) 16 bits, see `ops.raycast.Raycast`
     **{f"bricks_{a}": ctypes.c_int64 for a in AXES},  # their number
     "edge": ctypes.c_int64,  # of a brick, log₂ of its cells
     "t": ctypes.c_void_p,  # (R) d, written: where the first hit is

@@ -1,7 +1,7 @@
 """Casting rays as vector code: describes lattices and rays to the programs of `ops.cpu.crossings`.
 
-Memory beyond the result: one byte for every brick; for candidates 24 + 1 bytes and n + 1 numbers for every ray and each
-of the `capacity` that there is room for.
+Memory beyond the result: two bytes for every brick; for candidates 24 + 1 bytes and n + 1 numbers for every ray and
+each of the `capacity` that there is room for.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _job(given: Raycast, coefficients: Tensor) -> RaycastJob:
         shift=lattice.shift - given.level,
         edge=given.edge.bit_length() - 1,
     )
-    for axis, cells, bricks in zip(AXES, lattice.cells, given.clear.shape[::-1], strict=True):
+    for axis, cells, bricks in zip(AXES, lattice.cells, given.marks.shape[::-1], strict=True):
         setattr(job, f"cells_{axis}", cells)
         setattr(job, f"bricks_{axis}", bricks)
     numbers = {
@@ -107,5 +107,5 @@ def _job(given: Raycast, coefficients: Tensor) -> RaycastJob:
         "upper": lattice.upper,
     }
     arrays = {name: torch.tensor(x, dtype=torch.float64) for name, x in numbers.items()}
-    job.point(coefficients=coefficients, clear=given.clear.contiguous(), **arrays)
+    job.point(coefficients=coefficients, marks=given.marks.contiguous(), **arrays)
     return job

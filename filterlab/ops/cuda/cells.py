@@ -20,7 +20,7 @@ _MATRIX = tuple(f"matrix_{i}{k}" for i in range(3) for k in range(3))
 NUMBERS = (*(f"{name}_{axis}" for name in _TRIPLES for axis in AXES), *_MATRIX, "infinity")
 """float64, in memory; see `ops.cpu.crossings.FIELDS`."""
 SIZES = ("rays", *(f"{name}_{axis}" for name in ("cells", "bricks") for axis in AXES), "edge")
-ARRAYS = ("origins", "directions", "clear", "numbers")
+ARRAYS = ("origins", "directions", "marks", "numbers")
 
 _EXPONENT = 0x7FF << 52
 _FLIP = 2046 << 52  # 2^(e − 1023) and 2^(1023 − e) have exponents that add up to this
@@ -155,25 +155,32 @@ class Walk:
         line(f"far = {smaller('far', 'end')}")
 
     def _look(self) -> None:
-        """Whoever is in a brick that may hold the level has found its cell."""
-        for a in AXES:
-            self.line(f"brick_{a} = cell_{a} >> edge")
-        self.line("known = tl.load(clear + (brick_z * bricks_y + brick_y) * bricks_x + brick_x, on, 0).to(tl.int32)")
-        self.line("found = found | (on & (known == 0))")
-        self.line("on = on & (known != 0)")
-
-    def _leap(self) -> None:
-        """Over the clear bricks around."""
+        """Whoever is in a part of a brick that may hold the level has found its cell."""
         line = self.line
         for a in AXES:
-            line(f"plane_{a} = (brick_{a} + (backward_{a} ^ (known - 1)) + 1) << edge")
+            line(f"brick_{a} = cell_{a} >> edge")
+            line(f"part_{a} = (cell_{a} >> (edge - 1)) & 1")
+        line("mark = tl.load(marks + (brick_z * bricks_y + brick_y) * bricks_x + brick_x, on, 0).to(tl.int32)")
+        line("holds = on & (mark > 0) & (((mark >> (part_x + 2 * part_y + 4 * part_z)) & 1) > 0)")
+        line("found = found | holds")
+        line("on = on & ~holds")
+
+    def _leap(self) -> None:
+        """Over the clear bricks around, or the clear part of a brick."""
+        line = self.line
+        line("shift_by = tl.where(mark < 0, edge, edge - 1)")
+        line("radius = tl.where(mark < 0, -1 - mark, 0)")
+        for a in AXES:
+            line(f"brick_{a} = cell_{a} >> shift_by  # or the part, as a brick of half the edge")
+            line(f"plane_{a} = (brick_{a} + (backward_{a} ^ radius) + 1) << shift_by")
         self._cross()
         line(f"reached = {larger('least', 's')}")
         line("over = ~(reached < end)")
         for a in AXES:
             line(f"place = tl.floor(reached * direction_{a} + entry_{a})")
-            line(f"lowest = (brick_{a} - (known - 1)) << edge")
-            line(f"highest = tl.minimum(((brick_{a} + known) << edge) - 1, cells_{a} - 1)  # also on the domain's end")
+            line(f"lowest = (brick_{a} - radius) << shift_by")
+            line(f"highest = (brick_{a} + radius + 1) << shift_by")
+            line(f"highest = tl.minimum(highest - 1, cells_{a} - 1)  # also on the domain's end")
             line(f"whole_place = {self._within('place.to(tl.int32)', 'lowest', 'highest')}")
             line(f"next_{a} = tl.where(through_{a}, plane_{a} + backward_{a}, whole_place)")
             line(f"over = over | {self._outside(a)}")

@@ -48,7 +48,7 @@ def _cast(
     arithmetic = str(given.dtype).removeprefix("torch.")
     variant = RaycastVariant(asked, lattice.stencil.lowered, lattice.degree, lattice.continuous, arithmetic)
     rays = {"origins": origins.to(given.dtype), "directions": directions.to(given.dtype)}
-    arrays = {**rays, "clear": given.clear, "numbers": _numbers(given), **own}
+    arrays = {**rays, "marks": given.marks, "numbers": _numbers(given), **own}
     coefficients = in_whole_rows(lattice.coefficients)
     handed = [arrays[name].detach().resolve_neg().contiguous() for name in (*ARRAYS[1:], *variant.own)]
     sizes = {**_sizes(given, coefficients), "rays": len(origins), "capacity": capacity}
@@ -72,7 +72,7 @@ def _sizes(given: Raycast, coefficients: Tensor) -> dict[str, int]:
     plane, row, _ = coefficients.stride()
     numbers = {"width": row, "height": plane // row, "edge": given.edge.bit_length() - 1}
     numbers |= {f"cells_{a}": n for a, n in zip(AXES, given.lattice.cells, strict=True)}
-    return numbers | {f"bricks_{a}": n for a, n in zip(AXES, given.clear.shape[::-1], strict=True)}
+    return numbers | {f"bricks_{a}": n for a, n in zip(AXES, given.marks.shape[::-1], strict=True)}
 
 
 @lru_cache(maxsize=256)

@@ -19,8 +19,8 @@ def missing(given: Raycast, origins: Tensor) -> str | None:
     room = cuda if _implementation_for(given) == "cuda" else cpu
     if problem := room.missing(given.lattice.coefficients.detach()[None, None], points, given.lattice.stencil):
         return problem
-    if given.clear.numel() >= 1 << 31:
-        return f"up to {1 << 31} bricks; got {given.clear.numel()}"
+    if given.marks.numel() >= 1 << 31:
+        return f"up to {1 << 31} bricks; got {given.marks.numel()}"
     return None
 
 

@@ -41,7 +41,7 @@ def _pieces(given: Raycast, origins: Tensor, directions: Tensor) -> Pieces:
     """The pieces of rays (R, 3) in bricks that may hold the level."""
     lattice = given.lattice
     own = in_cells(origins, directions, given.geometry, lattice)
-    return pieces_of_rays(own, lattice, given.dtype, given.edge, given.clear == 0)
+    return pieces_of_rays(own, lattice, given.dtype, given.edge, given.marks > 0)
 
 
 def first_of(search: Search, origins: Tensor, directions: Tensor, most: int) -> Tensor:
