@@ -35,6 +35,7 @@ _NAMES = (
     "root_finding",
     "hit_error",
     "isosurface_quality",
+    "partitions",
     "demo",
 )
 

@@ -19,7 +19,9 @@ from filterlab import kernels, missing_values, prefilters
 from filterlab.fields.base import Field
 from filterlab.fields.grid import Coefficients, GridField, Scheme, Term, implementation_of
 from filterlab.fields.ncrsi import NCRSI_TERMS, SevenSamples
+from filterlab.fields.octahedral import QUADRATIC_C1
 from filterlab.fields.storage import named_storage
+from filterlab.fields.tetrahedral_pieces import FieldOnTetrahedra
 from filterlab.fields.tensor_product import (
     Direct,
     EightTrilinearCubic,
@@ -29,6 +31,8 @@ from filterlab.fields.tensor_product import (
     named_sampler,
     same_kernel,
 )
+from filterlab.fields.tetrahedral import OnTetrahedra, Spline
+from filterlab.fields.type6 import CUBIC_C1, QSS
 from filterlab.kernels import Kernel, PiecewisePolynomial, TensorKernel
 from filterlab.ops.differentiable import gather
 from filterlab.prefilters import Prefilter
@@ -137,6 +141,13 @@ class Asked:
     sampler: str | Sampler = "exact"
     storage: str | torch.dtype | None = None
 
+    def coefficients(
+        self, prefilter: Prefilter, reach: int, storage: torch.dtype | None, factor: kernels.Factor | None = None
+    ) -> Coefficients:
+        """The samples, filtered if that is asked, padded and stored; see `Coefficients.of`."""
+        chosen = prefilter if self.prefilter else prefilters.IDENTITY
+        return Coefficients.of(self.samples, chosen, self.boundary, reach, factor, storage, self.unknown)
+
 
 @dataclass(frozen=True)
 class TensorProduct(Method):
@@ -220,20 +231,61 @@ class TensorProduct(Method):
 
     def build(self, volume: Volume, asked: Asked) -> Field:
         scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
-        coefficients = Coefficients.of(
-            asked.samples,
-            self.prefilter if asked.prefilter else prefilters.IDENTITY,
-            asked.boundary,
-            scheme.reach,
-            self.factor,
-            _storage_for(self, asked.storage),
-            asked.unknown,
-        )
+        coefficients = asked.coefficients(self.prefilter, scheme.reach, _storage_for(self, asked.storage), self.factor)
         if isinstance(scheme, Direct) and scheme.name == "fused" and (why := _missing_for_fused(coefficients, scheme)):
             if asked.scheme is not None:
                 raise ValueError(f"scheme='fused' can't run here: {why}; scheme='direct' can")
             scheme = replace(scheme, name="direct")
         return GridField(self.name, volume, coefficients, scheme)
+
+
+@dataclass(frozen=True)
+class Tetrahedral(Method):
+    """Prefilter + spline on tetrahedra.
+
+    Published, these splines are quasi-interpolants of order 2, Q f = f + h²/8 Δf + O(h⁴), for quadratic f exactly. The
+    inverse of the sampled quadratic B-spline, 1 + ω²/8 + … along every axis, cancels that term: order 3.
+
+    Attributes:
+        spline: what is evaluated.
+        continuity: m, it is C^m everywhere.
+        prefilter: samples to coefficients.
+    """
+
+    spline: Spline
+    continuity: int
+    prefilter: Prefilter = prefilters.QUADRATIC
+    gradients: tuple[str, ...] = ("analytic",)
+    schemes: tuple[str, ...] = ("direct",)
+
+    @cached_property
+    def facts(self) -> Facts:
+        return Facts(
+            support=self.spline.support,
+            taps=len(self.spline.samples),
+            approximation_order=3,
+            approximation_order_without_prefilter=2,
+            continuity=self.continuity,
+            interpolating=False,
+            interpolating_without_prefilter=False,
+            prefiltered=True,
+            gradients=self.gradients,
+            schemes=self.schemes,
+        )
+
+    def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> Scheme:
+        self._check_offered(name, gradient)
+        if sampler != "exact":
+            raise ValueError(f"sampler={sampler!r} needs scheme='sampled'; {self.name} takes no samples between voxels")
+        return OnTetrahedra(self.spline)
+
+    def reach(self, prefilter: bool) -> int:
+        return self.spline.support + (self.prefilter.decay(torch.float64) if prefilter else 0)
+
+    def build(self, volume: Volume, asked: Asked) -> Field:
+        scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
+        coefficients = asked.coefficients(self.prefilter, scheme.reach, named_storage(asked.storage))
+        return FieldOnTetrahedra(self.name, volume, coefficients, scheme)
 
 
 _FORMER_SCHEMES = {"eight_trilinear": "sampled"}
@@ -303,6 +355,14 @@ METHODS: dict[str, Method] = {
             kernels.bspline(3),
             prefilters.CUBIC,
             sampled=EightTrilinearCubic,
+        ),
+        Tetrahedral("qss", "prefiltered quadratic super spline on 24 tetrahedra a cube: C1 across cubes", QSS, 0),
+        Tetrahedral("cubic-c1", "prefiltered cubic spline on the same: C1, degree 3 along any ray", CUBIC_C1, 1),
+        Tetrahedral(
+            "quadratic-c1",
+            "prefiltered quadratic spline on truncated octahedra: C1, degree 2 along any ray",
+            QUADRATIC_C1,
+            1,
         ),
     )
 }

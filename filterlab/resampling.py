@@ -63,7 +63,7 @@ def resample(
     )
     steps = np.linalg.solve(volume.affine, geometry.affine)  # new voxel -> old voxel
     off_axis = np.abs(steps[:3, :3] - np.diag(np.diag(steps[:3, :3]))).max()
-    if isinstance(field, GridField) and off_axis <= 1e-12 * np.abs(steps[:3, :3]).max():
+    if isinstance(field, GridField) and field.scheme.terms and off_axis <= 1e-12 * np.abs(steps[:3, :3]).max():
         samples = _separable(field, target_shape, np.diag(steps)[:3], steps[:3, 3], working)
     else:
         samples = _pointwise(field, volume.samples.device, target_shape, geometry, working)

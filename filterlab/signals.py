@@ -95,7 +95,7 @@ class Signal(Field):
         """One piece a ray, through its values at n + 1 places."""
         n = self.degree_along_rays
         if n is None:
-            raise self._no_pieces()
+            raise self.no_pieces()
         lines, ray, start = inside(origins.double(), directions.double(), self.domain.lower, self.domain.upper)
         places, matrix = (torch.tensor(x, device=origins.device, dtype=torch.float64) for x in _interpolation(n))
         t = lines.far[:, None] * places
@@ -136,7 +136,7 @@ class Signal(Field):
             return crossings(along, length, speed, self.bounds, first)
         if self.step is not None:
             return stepped(along, length, speed, self.step)
-        raise self._no_pieces()
+        raise self.no_pieces()
 
     # --- at points ---
 

@@ -25,6 +25,7 @@ FLOORS = {
     "bernstein": 0,
     "roots": 0,
     "prefilters": 1,
+    "signed_distances": 1,
     "ops": 2,
     "fields": 3,
     "missing_values": 3,

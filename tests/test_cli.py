@@ -72,7 +72,7 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_line_that_makes_no_sense(capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.nrrd"
-    fails(capsys, ["rendr"], 2, "render, mesh, resample, recommend, methods, info")
+    fails(capsys, ["rendr"], 2, "render, mesh, sdf, resample, recommend, methods, info")
     fails(capsys, ["resample", volume_file], 2, "--output")
     fails(capsys, ["resample", volume_file, "-o", out], 2, "one of --spacing, --shape and --like; got none")
     fails(capsys, ["resample", volume_file, "-o", out, "--spacing", "1", "1"], 2, "--spacing")

@@ -16,6 +16,7 @@ from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction
 from filterlab.roots import all_roots, first_root
 from filterlab.surfaces import LevelSet
 from filterlab.volume import Boundary, Volume
+from tests.test_methods import TENSOR_PRODUCTS
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU that torch can use")
 
@@ -161,7 +162,7 @@ def _hits(device: str, method: str, dtype: torch.dtype) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_hits_and_their_derivatives(method: str, dtype: torch.dtype) -> None:
     """A ray or two of float32 may graze the level, and pass on one device."""
     expected, found = _hits("cpu", method, dtype), _hits("cuda", method, dtype)

@@ -19,6 +19,7 @@ from filterlab.methods import METHODS
 from filterlab.surfaces import LevelSet, Mesh, mesh, meshes
 from tests import oracles
 from tests.laws import assert_close
+from tests.test_methods import TENSOR_PRODUCTS
 
 BOUNDARIES = [str(b) for b in fl.Boundary]
 OBLIQUE = np.array([[0.5, 0.1, 0.0, 3.0], [0.0, 0.7, 0.2, 1.0], [0.1, 0.0, 1.3, 5.0], [0.0, 0.0, 0.0, 1.0]])
@@ -48,7 +49,7 @@ def turns(made: Mesh) -> np.ndarray:
 # --- on the surface ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("method", "boundary"), list(product(METHODS, BOUNDARIES)))
+@pytest.mark.parametrize(("method", "boundary"), list(product(TENSOR_PRODUCTS, BOUNDARIES)))
 def test_vertices_lie_on_the_level_set_by_the_published_formula(method, boundary):
     """Value and normal against the oracle, which shares no code; the mesh is closed and goes round one way."""
     samples = closed_noise()
@@ -84,7 +85,7 @@ def test_there_is_one_vertex_on_every_edge_that_the_surface_crosses(method):
     assert 0 < np.count_nonzero(off_the_grid.sum(1) == 3) < 0.1 * expected  # those in the middle of cells
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_rays_along_edges_hit_their_vertices(method):
     """From the grid point before every vertex to the next: a hit, found from polynomials, is the vertex."""
     surface = LevelSet(field_of(closed_noise(2), method, affine=np.eye(4)), LEVEL)

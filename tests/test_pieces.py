@@ -13,8 +13,10 @@ import filterlab as fl
 from filterlab import bernstein, kernels
 from filterlab.fields import ranges as bounds
 from filterlab.kernels import KERNELS
-from filterlab.methods import METHODS, from_kernel
+from filterlab.methods import from_kernel
+from filterlab.ops.reference import bounds as hulls
 from tests import oracles
+from tests.test_methods import TENSOR_PRODUCTS
 
 BOUNDARIES = [str(b) for b in fl.Boundary]
 AFFINE = np.array([[1.0, 0.2, 0.0, 3.0], [0.0, 0.5, 0.1, 1.0], [0.1, 0.0, 2.0, -5.0], [0.0, 0.0, 0.0, 1.0]])
@@ -67,7 +69,7 @@ def within(pieces, count: int = 3) -> Tensor:
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_pieces_are_the_field_as_its_definition_gives_it(method, boundary):
     volume = fl.Volume(samples(4, 5, 6), affine=AFFINE)
     field = fl.reconstruct(volume, method, boundary=boundary)
@@ -84,7 +86,7 @@ def test_pieces_are_the_field_as_its_definition_gives_it(method, boundary):
 DEGREES = {"trilinear": 3, "ncrsi": 5, "triquadratic": 6, "notch": 6, "catmull-rom": 9, "mitchell": 9, "tricubic": 9}
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_degrees_along_rays(method):
     assert fl.reconstruct(samples(3, 3, 3), method).degree_along_rays == DEGREES[method]
 
@@ -113,7 +115,7 @@ def test_pieces_of_a_kernel_that_is_a_tensor():
 
 
 @pytest.mark.parametrize("storage", ["float16", "bfloat16", "float32", "int16", "uint8"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_storage(method, storage):
     field = fl.reconstruct(100 + 7 * samples(4, 5, 6), method, storage=storage)
     origins, directions = rays(field)
@@ -124,7 +126,7 @@ def test_storage(method, storage):
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_pieces_cover_the_domain_and_share_their_ends(method, boundary):
     """Without gap or overlap from where a ray enters to where it leaves, and equal to the bit where two meet."""
     field = fl.reconstruct(fl.Volume(samples(4, 5, 6), affine=AFFINE), method, boundary=boundary)
@@ -144,7 +146,7 @@ def test_pieces_cover_the_domain_and_share_their_ends(method, boundary):
         assert torch.equal(pieces.coefficients[1:][joined[1:], 0], pieces.coefficients[:-1][joined[1:], -1])
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_pieces_of_awkward_rays(method):
     field = fl.reconstruct(fl.Volume(samples(4, 5, 6), affine=AFFINE), method)
     origins, directions = awkward_rays(field)
@@ -158,7 +160,7 @@ def test_pieces_of_awkward_rays(method):
     assert float(error.max()) < 1e-8  # from afar: the rounding of o + t d itself
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_float32_is_rounded_only(method):
     field = fl.reconstruct(samples(6, 6, 6), method, boundary="reflect")
     origins, directions = (x.float() for x in rays(field))
@@ -203,7 +205,7 @@ def straddling(pieces, level: float) -> list[tuple[int, float, float]]:
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_bounds_hold_everywhere_in_a_brick(method, boundary):
     field = fl.reconstruct(fl.Volume(samples(9, 7, 6)), method, boundary=boundary, storage="int16")
     lattice = field.lattice
@@ -215,7 +217,7 @@ def test_bounds_hold_everywhere_in_a_brick(method, boundary):
     assert bool((found.codes.most(found.high[part]) >= values - 1e-12).all())
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_no_piece_that_may_hold_the_level_is_left_out(method):
     field = fl.reconstruct(samples(12, 11, 10) ** 6, method)
     origins, directions = rays(field, 60)
@@ -230,8 +232,8 @@ def test_bounds_do_not_depend_on_what_is_summed_at_once(edge, monkeypatch):
     lattice = fl.reconstruct(samples(9, 7, 6), "triquadratic").lattice
     found = []
     for at_once in (1, 8, 1000):
-        monkeypatch.setattr(bounds, "_cells_at_once", lambda lattice, at_once=at_once: at_once)
-        low, high = zip(*bounds.layers_of(lattice, edge), strict=True)
+        monkeypatch.setattr(hulls, "_cells_at_once", lambda lattice, at_once=at_once: at_once)
+        low, high = zip(*hulls.layers_of(lattice, edge), strict=True)
         found.append(torch.stack((torch.cat(low), torch.cat(high))))
     assert torch.equal(found[0], found[1])
     assert torch.equal(found[0], found[2])
@@ -284,7 +286,7 @@ def test_bounds_of_what_is_not_finite_are_none():
     s[9, 9, 9] = math.nan
     field = fl.reconstruct(s, "tricubic", nan="propagate")
     found = bounds.ranges(field.lattice)
-    unknown = torch.cat([low for low, _ in bounds.layers_of(field.lattice, 1)]).isnan()
+    unknown = torch.cat([low for low, _ in hulls.layers_of(field.lattice, 1)]).isnan()
     assert bool(unknown.any())
     assert not bool(unknown.all())
     assert torch.equal(found.may_hold(50.0, torch.float64), unknown)

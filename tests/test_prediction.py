@@ -18,6 +18,7 @@ from filterlab.prediction import (
     rms_second_derivative,
     spectrum_of,
 )
+from tests.test_methods import TENSOR_PRODUCTS
 
 SMOOTH = [("marschner-lobb", {}, 64), ("gaussian", {"sigma": 0.15}, 24)]
 
@@ -37,7 +38,7 @@ def measured(signal, n: int, method: str, gradient: str | None = None, step: int
     return float(metrics.rms(v, w)), voxel * float(metrics.rms(g, h, vectors=True))
 
 
-@pytest.mark.parametrize("method", fl.METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 @pytest.mark.parametrize(("name", "parameters", "n"), SMOOTH)
 def test_holds_within_15_percent_where_the_data_are_resolved(name, parameters, n, method) -> None:
     signal = fl.signals.named(name, **parameters)
@@ -89,7 +90,7 @@ def test_a_plane_wave_has_the_error_of_its_frequency() -> None:
 
 def test_what_every_method_reproduces_has_no_error() -> None:
     constant = spectrum_of(torch.full((8, 9, 10), 3.0))
-    for method in fl.METHODS:
+    for method in TENSOR_PRODUCTS:
         found = predicted_error(constant, method)
         assert found.value < 1e-6
         assert found.gradient < 1e-6

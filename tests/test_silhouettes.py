@@ -11,11 +11,11 @@ from torch import Tensor
 import filterlab as fl
 from experiments.config import Recipe
 from experiments.silhouettes import Depth, Scene, between, chance, mean_and_error, normal, welch
-from filterlab.methods import METHODS
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Phong, Silhouettes, raycast, silhouettes
 from filterlab.render.image import PixelRays, check_background
 from filterlab.render.raycast import Casting
 from filterlab.surfaces import LevelSet
+from tests.test_methods import TENSOR_PRODUCTS
 
 F64 = torch.float64
 N, RADIUS, SIZE = 16, 3.0, (14, 12)
@@ -64,7 +64,7 @@ def eye(method: str, amount: Tensor, level: Tensor, position: Tensor) -> silhoue
     return casting.eye(seen, ("color",))
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_edges_move_as_their_derivative_says(method):
     """On folds, smooth and on creases between cells, and on faces: by the places where they are found again."""
     given = [torch.tensor(x, dtype=F64, requires_grad=True) for x in (0.0, -1.0, [4.0, -18.0, 6.0])]

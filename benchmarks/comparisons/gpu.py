@@ -23,7 +23,6 @@ from benchmarks.scene import Scene, blobs, marschner_lobb, without_skipping
 from benchmarks.settings import Settings
 from filterlab import ops
 from filterlab.kernels import bspline
-from filterlab.methods import METHODS
 from filterlab.ops.differentiable.prefilter import prefilter_samples
 from filterlab.roots import first_root
 
@@ -217,7 +216,7 @@ def _hits(settings: Settings) -> Race:
     rays = task.origins, task.directions
     contestants = [
         _finished(method, partial(surfaces.hits_and_normals, surfaces.surface_of(task, method), task), None, task.rays)
-        for method in METHODS
+        for method in surfaces.SEARCHED
     ]
     surface = surfaces.surface_of(task, "triquadratic")
     contestants.append(

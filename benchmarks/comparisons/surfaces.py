@@ -19,11 +19,14 @@ from benchmarks.probe import measured
 from benchmarks.records import Figure, Outcome, Spread, at_least, at_most
 from benchmarks.scene import marschner_lobb
 from benchmarks.settings import Settings
-from filterlab.methods import METHODS, reconstruct
+from filterlab.methods import METHODS, reconstruct, tensor_product
 from filterlab.surfaces import LevelSet
 
 _LEVEL = 0.5
 _LEVELS = (0.48, 0.49, 0.5, 0.51, 0.52)
+SEARCHED = tuple(name for name in METHODS if tensor_product(name))
+"""Methods whose level sets are found."""
+
 _BARS = {"trilinear": at_most("0.25"), "triquadratic": at_most("0.45"), "tricubic": at_most("0.9")}
 _PROCESSES = 3  # of which the peak memory is taken
 _PLAIN = 64  # pixels along an edge of what plain torch casts
@@ -64,7 +67,7 @@ def _hits(task: Casting, method: str, scheme: str = "fused", name: str | None = 
 
 def _first(settings: Settings) -> Race:
     task = task_of(settings)
-    contestants, absent, ratios = [_hits(task, method) for method in METHODS], {}, []
+    contestants, absent, ratios = [_hits(task, method) for method in SEARCHED], {}, []
     for peer in casters():
         if why := peer.missing():
             absent[peer.NAME] = why
@@ -102,7 +105,7 @@ def _plain(settings: Settings) -> Race:
     """Fewer rays: plain torch takes some 0.2 ms for each."""
     task = task_of(settings, min(_PLAIN, settings.image))
     contestants, ratios = [], []
-    for method in METHODS:
+    for method in SEARCHED:
         contestants += [_hits(task, method, scheme, f"{method}, {scheme}") for scheme in ("fused", "direct")]
         ratios.append(Ratio(f"{method}, fused", f"{method}, direct", at_most("1/30")))
     return Race(f"{described(task)}: first hits and normals", contestants, ratios)

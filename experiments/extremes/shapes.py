@@ -12,7 +12,7 @@ from torch import Tensor
 
 import filterlab as fl
 from experiments.extremes.contract import Case, Finding, Subject, Tally
-from experiments.extremes.coordinates import SWEEP, field_of, largest, points_inside, refusal, samples_on
+from experiments.extremes.coordinates import SWEEP, field_of, largest, points_inside, refusal, samples_on, spline_of
 
 # --- nothing ----------------------------------------------------------------------------------------------------------
 
@@ -53,7 +53,9 @@ def small_axes(subject: Subject, random: np.random.Generator, amount: float) -> 
         samples = torch.tensor(random.uniform(-1, 1, shape), dtype=torch.float32, device=subject.device)
         grid = torch.stack(torch.meshgrid(*(torch.arange(float(n)) for n in shape), indexing="ij"), -1).flip(-1)
         points = points_inside(random, 50, subject.device)
-        moved = [_moved(points, axis, random) for axis in range(3) if shape[2 - axis] == 1]
+        spline = spline_of(field_of(subject, samples))
+        step = spline.period if spline and spline.period > 1 else 0
+        moved = [_moved(points, axis, random, step) for axis in range(3) if shape[2 - axis] == 1]
         far = points[:20].sign() * 1000
         asked = [grid.reshape(-1, 3).to(subject.device), far, points, *moved]
         on_grid, outside, here, *there = field_of(subject, samples)(torch.cat(asked)).split([len(x) for x in asked])
@@ -67,9 +69,13 @@ def small_axes(subject: Subject, random: np.random.Generator, amount: float) -> 
     return tally.finding()
 
 
-def _moved(points: Tensor, axis: int, random: np.random.Generator) -> Tensor:
+def _moved(points: Tensor, axis: int, random: np.random.Generator, step: int) -> Tensor:
+    """Somewhere else along an axis; by whole steps on octahedra, which are told apart along one voxel too."""
     moved = points.clone()
-    moved[:, axis] = torch.tensor(random.uniform(-9, 9, len(points)), dtype=torch.float32)
+    if step:
+        moved[:, axis] += step * torch.tensor(random.integers(-4, 5, len(points)), device=points.device)
+    else:
+        moved[:, axis] = torch.tensor(random.uniform(-9, 9, len(points)), dtype=torch.float32)
     return moved
 
 
@@ -170,7 +176,8 @@ CASES = (
     Case(
         "small-axes",
         "axes of one and two voxels",
-        "Every sample is interpolated where the method does; constant along one voxel (under zeros: 0 outside).",
+        "Every sample is interpolated where the method does; constant along one voxel but for octahedra (under zeros: "
+        "0 outside).",
         small_axes,
         SWEEP,
         0.1,

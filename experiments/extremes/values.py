@@ -10,7 +10,7 @@ from experiments.extremes.contract import Case, Finding, Subject, Tally
 from experiments.extremes.coordinates import SWEEP, field_of, largest, points_inside, refusal, samples_on
 from filterlab.fields.storage import STORAGE
 from filterlab.fields.tensor_product import Direct
-from filterlab.methods import tensor_product
+from filterlab.methods import TensorProduct, Tetrahedral, named
 from filterlab.render.bricks import bound
 
 ROUNDING = 2.0**-24
@@ -130,8 +130,10 @@ def short_storage(subject: Subject, random: np.random.Generator, amount: float) 
 
 def _norm(subject: Subject) -> float:
     """The largest Σ |w| of the weights of a value."""
-    method = tensor_product(subject.method)
-    assert method is not None, "only tensor products are sums of weights"
+    method = named(subject.method)
+    if isinstance(method, Tetrahedral):
+        return float(method.spline.norm)
+    assert isinstance(method, TensorProduct)
     stencil = Direct(method.value_terms).stencils[0]
     return bound(stencil.lowered)[2]
 

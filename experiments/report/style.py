@@ -29,6 +29,9 @@ LOOKS: dict[str, Look] = {
     "notch": Look("#c44a00", "#f07a3a", "v"),
     "mitchell": Look("#b8608f", "#d98ab5", "P"),
     "tricubic": Look("#008060", "#2fb88f", "X"),
+    "qss": Look("#a8336f", "#e070a4", "<"),
+    "cubic-c1": Look("#6a3fb0", "#a98be6", "d"),
+    "quadratic-c1": Look("#8a6d00", "#c9a81e", ">"),
 }
 OTHERS = (
     Look("#5b4b9a", "#9c8ee0", "*"),

@@ -127,7 +127,7 @@ class Field(ABC):
         Raises:
             TypeError: the field is not piecewise polynomial. ValueError: it is batched.
         """
-        raise self._no_pieces()
+        raise self.no_pieces()
 
     def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
         """Where rays first meet a level: t (...) float64 in units of the direction, ∞ where they don't.
@@ -153,9 +153,10 @@ class Field(ABC):
 
     def relevant(self, level: float) -> Relevant:
         """How many cells of the domain, and pieces in them, may hold a level. Raises as `pieces_along` does."""
-        raise self._no_pieces()
+        raise self.no_pieces()
 
-    def _no_pieces(self) -> TypeError:
+    def no_pieces(self) -> TypeError:
+        """What to say where pieces are asked of a field that has none."""
         return TypeError(f"{type(self).__name__} ({self.scheme.name}) is not piecewise polynomial along rays")
 
     @abstractmethod

@@ -335,8 +335,8 @@ class GridField(Field):
     def _check_pieces(self) -> None:
         if self.channels is not None:
             raise ValueError("pieces are those of one channel: `select` it from this batched field")
-        if not self.scheme.exact:
-            raise self._no_pieces()
+        if self.degree_along_rays is None:
+            raise self.no_pieces()
 
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         check_order(order, self.max_order)

@@ -2,7 +2,7 @@ from .atomic import atomic_write
 from .bounded import VolumeFileError, VolumeHeader
 from .config import ConfigError, StrictModel, dump_config, load_config
 from .images import load_image, save_image
-from .meshes import MESH_FORMATS, save_mesh
+from .meshes import MESH_FORMATS, load_mesh, save_mesh
 from .volumes import FORMATS, describe, load_volume, save_volume
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "dump_config",
     "load_config",
     "load_image",
+    "load_mesh",
     "load_volume",
     "save_image",
     "save_mesh",

@@ -1,10 +1,12 @@
-"""Triangle meshes out: PLY, OBJ and STL, written by trimesh (the extra `mesh`).
+"""Triangle meshes out and in: PLY, OBJ and STL, by trimesh (the extra `mesh`).
 
 | ending | what is written |
 |---|---|
 | .ply | binary: vertices and normals in float32, faces |
 | .obj | text: vertices and normals with 17 decimals, faces |
 | .stl | binary: the corners of every triangle for themselves, in float32; no normals of vertices |
+
+Whatever else trimesh reads is read too (OFF, glTF, …), and so are PLY files of triangle strips, by libigl.
 """
 
 from __future__ import annotations
@@ -14,7 +16,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
 from filterlab.io.atomic import atomic_write, check_writable
+from filterlab.signed_distances import Triangles, libigl
 from filterlab.surfaces.meshes import Mesh
 
 MESH_FORMATS: Mapping[str, Mapping[str, Any]] = {
@@ -66,12 +72,44 @@ def _content(mesh: Mesh, path: Path) -> bytes:
     return written.encode() if isinstance(written, str) else written
 
 
+def load_mesh(path: str | os.PathLike[str]) -> Triangles:
+    """The triangles in a file: vertices as float64, in the file's own units; several meshes become one.
+
+    Faces of more corners are cut into triangles. Vertices are neither merged nor moved.
+
+    Raises:
+        FileNotFoundError: no such file. ValueError: it holds no triangles, or cannot be read; or no trimesh.
+    """
+    path = Path(path)
+    if not path.is_file():
+        got = "a folder" if path.is_dir() else "no file of this name"
+        raise FileNotFoundError(f"{path}: expected a mesh file; got {got}")
+    _trimesh(path)
+    try:
+        return _read(path)
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:  # readers raise whatever they come upon
+        raise ValueError(f"{path}: expected a triangle mesh; got {type(error).__name__}: {error}") from error
+
+
+def _read(path: Path) -> Triangles:
+    import trimesh
+
+    loaded = trimesh.load_scene(path, process=False).to_mesh()
+    vertices, faces = loaded.vertices, loaded.faces
+    if not len(faces) and path.suffix.lower() == ".ply":  # strips, which trimesh leaves out
+        vertices, faces = libigl().read_triangle_mesh(str(path))
+    faces = torch.from_numpy(np.array(faces, np.int64)).reshape(-1, 3)
+    return Triangles(torch.from_numpy(np.array(vertices, np.float64)), faces)
+
+
 def _trimesh(path: Path) -> Callable[..., Any]:
     """The class of trimesh. Raises ValueError that names the extra to install."""
     try:
         from trimesh import Trimesh
     except ImportError:
         raise ValueError(
-            f"{path}: expected trimesh, which writes meshes (pip install 'filterlab[mesh]'); got no such package"
+            f"{path}: expected trimesh, for files of meshes (pip install 'filterlab[mesh]'); got no such package"
         ) from None
     return Trimesh

@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from filterlab.fields.ranges import over_windows
 from filterlab.ops.march import Bricks
+from filterlab.ops.reference.bounds import over_windows
 from filterlab.ops.stencil import Lowered, Stencil, Table
 from filterlab.render.transfer import TransferFunction
 

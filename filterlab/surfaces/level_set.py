@@ -122,8 +122,8 @@ def _checked(field: Field) -> Field:
         raise ValueError("a level set is that of one channel: `select` it from this batched field")
     if field.search is None:
         raise TypeError(
-            f"{type(field).__name__} ({field.scheme.name}) is not piecewise polynomial along rays, and nothing else is "
-            "known to find crossings by: a Signal is given its degree, bounds, or a step"
+            f"{field.no_pieces()}, and nothing else is known to find crossings by: a Signal is given its degree, "
+            "bounds, or a step"
         )
     degree = field.degree_along_rays
     if degree is not None and degree > MAX_DEGREE:

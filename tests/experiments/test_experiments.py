@@ -5,6 +5,7 @@ import json
 import math
 import re
 import struct
+from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 
@@ -17,7 +18,7 @@ import yaml
 import filterlab as fl
 from experiments import rms_error
 from experiments.__main__ import main
-from experiments.config import VolumeChoice, input_files, known_configs
+from experiments.config import Recipe, VolumeChoice, input_files, known_configs
 from experiments.dvr_signal import amplified_difference, displayed, image_errors
 from experiments.registry import EXPERIMENTS, load
 from experiments.runs import read_provenance, read_records
@@ -53,6 +54,7 @@ def tiny(name, scan):
             "markers": 9,
             "dimensions": [1],
         },
+        "partitions": {"splines": ["quadratic-c1", "qss"], "fineness": 2},
         "rms_error": {
             "studies": [{"signal": "gaussian", "resolutions": [4, 6], "fit_from": 4}],
             "methods": ["trilinear", {"name": "trilinear", "gradient": "central"}, "notch"],
@@ -285,38 +287,53 @@ def test_errors_are_those_of_the_definition(ran):
     assert other["gradient_rms"] != records["0/6/trilinear"]["gradient_rms"]
 
 
-# Value and gradient errors at 32³ and 64³, computed once by independent float64 prototypes.
+# Value and gradient errors at 32³ and 64³, computed once by independent float64 prototypes, by config.
 KNOWN = {
-    ("trilinear", 32): (0.0448, 2.56),
-    ("ncrsi", 32): (0.0405, 3.27),
-    ("catmull-rom", 32): (0.0402, 2.21),
-    ("triquadratic", 32): (0.0388, 2.12),
-    ("notch", 32): (0.0570, 3.11),
-    ("tricubic", 32): (0.0380, 2.05),
-    ("trilinear", 64): (0.0150, 1.43),
-    ("triquadratic", 64): (0.0028, 0.372),
-    ("notch", 64): (0.0058, 0.446),
+    "rms_error": {
+        ("trilinear", 32): (0.0448, 2.56),
+        ("ncrsi", 32): (0.0405, 3.27),
+        ("catmull-rom", 32): (0.0402, 2.21),
+        ("triquadratic", 32): (0.0388, 2.12),
+        ("notch", 32): (0.0570, 3.11),
+        ("tricubic", 32): (0.0380, 2.05),
+        ("trilinear", 64): (0.0150, 1.43),
+        ("triquadratic", 64): (0.0028, 0.372),
+        ("notch", 64): (0.0058, 0.446),
+    },
+    "tetrahedral_rms": {
+        ("qss", 32): (0.0407, 2.26),
+        ("cubic-c1", 32): (0.0390, 2.12),
+        ("quadratic-c1", 32): (0.0433, 2.48),
+        ("qss+unprefiltered", 32): (0.0523, 2.82),
+        ("cubic-c1+unprefiltered", 32): (0.0513, 2.76),
+        ("quadratic-c1+unprefiltered", 32): (0.0534, 2.89),
+        ("qss", 64): (0.00293, 0.372),
+        ("cubic-c1", 64): (0.00278, 0.352),
+        ("quadratic-c1", 64): (0.00431, 0.580),
+        ("qss+unprefiltered", 64): (0.0200, 1.13),
+        ("cubic-c1+unprefiltered", 64): (0.0198, 1.12),
+        ("quadratic-c1+unprefiltered", 64): (0.0204, 1.19),
+    },
 }
 
 
-def test_marschner_lobb_errors_are_the_known_ones(tmp_path):
-    known = sorted({n for _, n in KNOWN})
+@pytest.mark.parametrize("name", KNOWN)
+def test_marschner_lobb_errors_are_the_known_ones(name):
+    known = sorted({n for _, n in KNOWN[name]})
     changes = {"studies.0.resolutions": str(known), "studies.0.fit_from": "null", "points": "20000"}
-    _, _, config = load("rms_error", changes)
+    _, _, config = load(name, changes)
     study = config.studies[0]
     points, value, gradient = rms_error._truth(config, study)
     assert study.signal.name == "marschner-lobb"
     assert study.inner == 0.9
-    for n in known:
-        volume = study.signal.build().sample(n)
-        for recipe in config.methods:
-            if (recipe.key, n) not in KNOWN:
-                continue
-            v, g = rms_error.evaluate(recipe.build(volume, config.boundary), points)
-            found = fl.metrics.rms(v, value), fl.metrics.rms(g, gradient, vectors=True)
-            for number, expected in zip(found, KNOWN[recipe.key, n], strict=True):
-                # 2 %, plus the rounding of the two digits that 0.0028 and 0.0058 were written with
-                assert float(number) == pytest.approx(expected, rel=0.02, abs=5e-5 if expected < 0.01 else 0)
+    volumes = {n: study.signal.build().sample(n) for n in known}
+    recipes = {recipe.key: recipe for recipe in config.methods}
+    for (key, n), expected in KNOWN[name].items():
+        v, g = rms_error.evaluate(recipes[key].build(volumes[n], config.boundary), points)
+        found = fl.metrics.rms(v, value), fl.metrics.rms(g, gradient, vectors=True)
+        for number, written in zip(found, expected, strict=True):
+            # 2 %, plus the rounding of the two digits that 0.0028 and 0.0058 were written with
+            assert float(number) == pytest.approx(written, rel=0.02, abs=5e-5 if written < 0.01 else 0), (key, n)
 
 
 def test_the_slope_of_a_power_law_is_its_exponent():
@@ -582,16 +599,35 @@ def test_list_shows_every_config(capsys):
     assert all(len(line.split()) > 3 for line in lines)
 
 
-def test_fitted_orders_are_the_declared_ones(tmp_path):
-    """The study of the config that orders are read from, with fewer points and its two finest small resolutions."""
-    _, _, config = load("rms_error")
+def orders(name: str, chosen: Callable[[Recipe], bool]) -> dict[str, tuple[Recipe, float, float]]:
+    """Recipes of a config with their orders of value and gradient, from the study that orders are read from.
+
+    With fewer points, and its two finest small resolutions.
+    """
+    _, _, config = load(name)
     study = next(s for s in config.studies if s.signal.name == "gaussian")
     small = study.model_copy(update={"resolutions": [64, 128], "fit_from": 64})
-    points, value, _ = rms_error._truth(config.model_copy(update={"points": 3000}), small)
+    points, value, gradient = rms_error._truth(config.model_copy(update={"points": 3000}), small)
     volumes = [study.signal.build().sample(n) for n in small.fitted]
-    for recipe in config.methods:
-        if not recipe.prefilter or recipe.gradient is not None:
-            continue
-        fields = [recipe.build(volume, config.boundary) for volume in volumes]
-        errors = [float(fl.metrics.rms(field(points), value)) for field in fields]
-        assert rms_error.slope(small.fitted, errors) == pytest.approx(recipe.declared_order, abs=0.15), recipe.key
+    found = {}
+    for recipe in filter(chosen, config.methods):
+        jets = [rms_error.evaluate(recipe.build(volume, config.boundary), points) for volume in volumes]
+        values = [float(fl.metrics.rms(v, value)) for v, _ in jets]
+        gradients = [float(fl.metrics.rms(g, gradient, vectors=True)) for _, g in jets]
+        found[recipe.key] = recipe, *(rms_error.slope(small.fitted, errors) for errors in (values, gradients))
+    return found
+
+
+def test_fitted_orders_are_the_declared_ones():
+    found = orders("rms_error", lambda recipe: recipe.prefilter and recipe.gradient is None)
+    for key, (recipe, value, _) in found.items():
+        assert value == pytest.approx(recipe.declared_order, abs=0.15), key
+
+
+def test_fitted_orders_of_splines_on_tetrahedra():
+    """As declared for values, with and without prefilter, and 2 for all gradients."""
+    found = orders("tetrahedral_rms", lambda recipe: recipe.name in ("qss", "cubic-c1", "quadratic-c1"))
+    assert len(found) == 6
+    for key, (recipe, value, gradient) in found.items():
+        assert recipe.declared_order == (3 if recipe.prefilter else 2)
+        assert (value, gradient) == pytest.approx((recipe.declared_order, 2), abs=0.15), key

@@ -13,12 +13,13 @@ pytest.importorskip("triton", reason="the package triton is not installed")
 import filterlab as fl
 from filterlab.fields.grid import GridField
 from filterlab.kernels import KERNELS
-from filterlab.methods import METHODS, from_kernel
+from filterlab.methods import from_kernel
 from filterlab.ops.cuda import crossings, launch
 from filterlab.ops.cuda import raycast as cuda
 from filterlab.ops.differentiable import raycast
 from filterlab.ops.raycast import Raycast
 from tests.ops.test_raycast import AFFINE, described, rays, rays_on_the_last_faces, samples
+from tests.test_methods import TENSOR_PRODUCTS
 
 FEW, MANY = 33, 20_000  # the interpreter takes 50 ms for a ray; 33 are more than a program has
 
@@ -56,14 +57,14 @@ def assert_the_same_candidates(field: GridField, device: str) -> None:
 
 
 @pytest.mark.parametrize("boundary", ["mirror", "zeros"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_the_same_hits(method: str, boundary: str, device: str) -> None:
     if device == "cpu" and (method, boundary) not in {("triquadratic", "mirror"), ("ncrsi", "zeros")}:
         pytest.skip("the interpreter takes one method of each kind")
     assert_the_same_hits(fl.reconstruct(fl.Volume(samples(), affine=AFFINE), method, boundary=boundary), device)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_the_same_pieces(method: str, device: str) -> None:
     if device == "cpu" and method != "trilinear":
         pytest.skip("the interpreter takes the smallest")
@@ -88,7 +89,7 @@ def test_storage(storage: str, device: str) -> None:
     assert_the_same_hits(fl.reconstruct(samples(), "trilinear", storage=storage), device)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_float32_is_rounded_only(method: str, device: str) -> None:
     if device == "cpu" and method != "trilinear":
         pytest.skip("the interpreter takes the smallest")

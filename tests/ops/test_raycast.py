@@ -11,12 +11,13 @@ from torch import Tensor
 import filterlab as fl
 from filterlab.fields.grid import GridField
 from filterlab.kernels import KERNELS
-from filterlab.methods import METHODS, from_kernel
+from filterlab.methods import from_kernel
 from filterlab.ops import cpu
 from filterlab.ops.cpu import machine
 from filterlab.ops.cpu import raycast as vector_code
 from filterlab.ops.differentiable import raycast
 from filterlab.ops.raycast import Raycast, marks_of
+from tests.test_methods import TENSOR_PRODUCTS
 
 AFFINE = [[1.5, 0.2, 0.1, 3.0], [0.0, -0.8, 0.3, -2.0], [0.1, 0.0, 2.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
 LEVEL = 0.5
@@ -62,7 +63,7 @@ def assert_alike(field: GridField, tolerance: float = 1e-12) -> None:
 
 
 @pytest.mark.parametrize("boundary", ["mirror", "zeros"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_the_same_hits_and_pieces(method, boundary):
     assert_alike(fl.reconstruct(fl.Volume(samples(), affine=AFFINE), method, boundary=boundary))
 
@@ -99,7 +100,7 @@ def test_storage(storage):
     assert_alike(fl.reconstruct(samples(), "triquadratic", storage=storage))
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_float32_is_rounded_only(method):
     field = fl.reconstruct(samples(), method)
     o, d = rays(field, 2000, torch.float32)
@@ -113,7 +114,7 @@ def test_float32_is_rounded_only(method):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_neighbouring_pieces_share_their_ends_to_the_bit(method, dtype):
     field = fl.reconstruct(fl.Volume(samples(), affine=AFFINE), method)
     found = raycast.candidates(described(field, dtype), *rays(field, 2000, dtype), "cpu")

@@ -16,6 +16,7 @@ from filterlab.ops.cpu import march as driver
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.plain import PlainMarcher
 from filterlab.volume import Boundary, Volume
+from tests.test_methods import TENSOR_PRODUCTS
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 BOUNDARIES = [b.value for b in Boundary]
@@ -25,7 +26,7 @@ SOFT = TransferFunction(
     [0.1, 0.4, 0.9], [[0.2, 0.3, 0.9], [0.8, 0.5, 0.1], [0.4, 0.9, 0.3]], [0.01, 0.3, 0.1], unit=0.2
 )
 SCENE = {"size": (13, 11), "step": 0.6, "background": (0.1, 0.2, 0.3)}
-KINDS = [(name, gradient) for name, method in METHODS.items() for gradient in method.gradients]
+KINDS = [(name, gradient) for name in TENSOR_PRODUCTS for gradient in METHODS[name].gradients]
 TYPED = [(*kind, (torch.float32, torch.float64)[i % 2]) for i, kind in enumerate(KINDS)]
 TYPED += [("triquadratic", "analytic", torch.float32), ("ncrsi", "central", torch.float64)]
 

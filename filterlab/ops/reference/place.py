@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.place import Placement
-from filterlab.volume import all_between
+from filterlab.volume import Geometry, all_between
 
 
 def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
@@ -27,19 +27,25 @@ def _voxels(points: Tensor, placement: Placement) -> Tensor:
     largest = torch.finfo(voxels.dtype).max
     if placement.geometry.is_identity or all_between(voxels, -largest, largest):
         return voxels
-    return torch.where(voxels.isfinite(), voxels, _far_voxels(points, placement))
+    periods = [placement.boundary.period(n) for n in placement.size]
+    known = None if None in periods else points.new_tensor(periods)
+    return torch.where(voxels.isfinite(), voxels, far_voxels(points, placement.geometry, known))
 
 
-def _far_voxels(points: Tensor, placement: Placement) -> Tensor:
-    """The same by numbers that are small enough: matrix · (point − origin) / 2^k, and modulo period / 2^k is exact."""
-    geometry = placement.geometry
+def far_voxels(points: Tensor, geometry: Geometry, periods: Tensor | None) -> Tensor:
+    """Voxel coordinates by numbers small enough: matrix · (point − origin) / 2^k, and modulo period / 2^k is exact.
+
+    Args:
+        points: (..., 3); at infinity they lie where the description of `place` says.
+        geometry: voxel -> world.
+        periods: (3,), after how many voxels all repeats; None: it does not.
+    """
     infinite = points.isinf()
     ahead = geometry.direction_to_voxel(torch.where(infinite, points.sign(), 0))
     power = max(math.frexp(max(sum(map(abs, row)) for row in geometry.inverse))[1] + 1, 1)
     near = torch.where(infinite, 0, points) * 2.0**-power - points.new_tensor(geometry.origin) * 2.0**-power
     near = geometry.direction_to_voxel(near)
-    periods = [placement.boundary.period(n) for n in placement.size]
-    if None not in periods:
-        near = near.fmod(points.new_tensor(periods) * 2.0**-power)
+    if periods is not None:
+        near = near.fmod(periods * 2.0**-power)
     near = near * 2.0**power
     return torch.where(ahead == 0, near, ahead * torch.inf + near)

@@ -1,0 +1,466 @@
+"""Splines on tetrahedra: locate ▶ the samples a tetrahedron needs ▶ Bernstein coefficients ▶ value and derivatives.
+
+A partition cuts space into cells that are alike (cubes, truncated octahedra), and each cell into tetrahedra that meet
+in its centre. Signed permutations of the axes about a centre map the cell's tetrahedra onto one another. One of them
+brings a point into the cone x ≥ y ≥ z ≥ 0, where there are few tetrahedra: the spline's `Shape`s, with one exact mask
+for every Bernstein coefficient. With P the signed permutation that leads back from there,
+
+    s(centre + P x) = Σ_|α|=n  b_α · n!/α! · λ(x)^α,        b_α = Σ_o mask_α(o) · f(centre + P o)
+
+x in the cone, λ its barycentric coordinates, o where samples lie. Nothing else need be known to evaluate it.
+
+Under a boundary the samples go on to all integers, and the partition with them: it is not reflected. So points are
+moved by whole periods alone, of samples and partition both, and samples are found by tables of indices.
+
+Letters: P points, C channels; S shapes, K samples that one tetrahedron needs, B coefficients of one. The last axis runs
+over points.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from filterlab import bernstein
+from filterlab.bernstein import Index, multi_indices
+from filterlab.fields.grid import Coefficients, Evaluation, Term
+from filterlab.ops.differentiable.recording import plain
+from filterlab.ops.place import Placement
+from filterlab.ops.reference.place import far_voxels
+from filterlab.volume import Geometry, all_between
+
+Vector = tuple[Fraction, Fraction, Fraction]
+
+Mask = Mapping[Vector, Fraction]
+"""Where samples lie, relative to the centre of a cell -> their weights."""
+
+
+def weighted(*parts: tuple[Fraction, Mask]) -> Mask:
+    """Σ factor · mask, without the samples whose weights cancel."""
+    total: dict[Vector, Fraction] = {}
+    for factor, mask in parts:
+        for sample, weight in mask.items():
+            total[sample] = total.get(sample, Fraction(0)) + factor * weight
+    return {sample: weight for sample, weight in total.items() if weight}
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A tetrahedron that fills a part of the cone x ≥ y ≥ z ≥ 0, and the spline on it.
+
+    Attributes:
+        vertices: v_0 … v_3, relative to the centre of the cell.
+        masks: for every multi-index α of the degree n, of the domain point Σ α_k v_k / n, its coefficient's samples.
+    """
+
+    vertices: tuple[Vector, Vector, Vector, Vector]
+    masks: Mapping[Index, Mask]
+
+    def row(self, alpha: Index, samples: Sequence[Vector]) -> tuple[float, ...]:
+        """The weights of a mask, of all of these samples."""
+        return tuple(float(self.masks[alpha].get(o, 0)) for o in samples)
+
+    @cached_property
+    def barycentric(self) -> tuple[tuple[Fraction, ...], ...]:
+        """4 rows (d, n) with λ_k(x) = d + n · x: 1 at v_k, 0 on the plane of the other three."""
+        return tuple(_plane(self.vertices[k], *(v for i, v in enumerate(self.vertices) if i != k)) for k in range(4))
+
+
+def _plane(apex: Vector, a: Vector, b: Vector, c: Vector) -> tuple[Fraction, ...]:
+    """(d, n) with d + n · x = 1 at the apex and 0 at a, b, c."""
+    (x, y, z), (u, v, w) = (tuple(p - q for p, q in zip(end, a, strict=True)) for end in (b, c))
+    normal = (y * w - z * v, z * u - x * w, x * v - y * u)
+    height = sum((n * (p - q) for n, p, q in zip(normal, apex, a, strict=True)), Fraction(0))
+    level = sum((n * p for n, p in zip(normal, a, strict=True)), Fraction(0))
+    return -level / height, *(n / height for n in normal)
+
+
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """A spline on the tetrahedra of a partition.
+
+    Attributes:
+        name: of the spline.
+        degree: n.
+        shapes: the tetrahedra that fill the cone's part of a cell; all of them need the same samples.
+        cells: voxel coordinates (..., 3) -> the cell of each, (..., 3) whole numbers of the same type.
+        shift: the centre of a cell lies at cell + shift along every axis: 0 or ½.
+        period: how far the partition has to be moved along an axis to lie on itself: 1 or 2.
+
+    Raises ValueError where a shape has not a mask for every coefficient, or not the samples of the others.
+    """
+
+    name: str
+    degree: int
+    shapes: tuple[Shape, ...]
+    cells: Callable[[Tensor], Tensor]
+    shift: Fraction
+    period: int
+
+    def __post_init__(self) -> None:
+        for shape in self.shapes:
+            if set(shape.masks) != set(multi_indices(self.degree, 3)):
+                raise ValueError(f"{self.name}: expected a mask for every coefficient of degree {self.degree}")
+            if {o for mask in shape.masks.values() for o in mask} != set(self.samples):
+                raise ValueError(f"{self.name}: its tetrahedra need different samples")
+
+    @cached_property
+    def samples(self) -> tuple[Vector, ...]:
+        """Where the samples lie that one tetrahedron needs, relative to the centre."""
+        return tuple(sorted({o for mask in self.shapes[0].masks.values() for o in mask}))
+
+    @cached_property
+    def support(self) -> int:
+        """Twice the farthest that a point is from a sample that it needs, along an axis."""
+        corners = [v for shape in self.shapes for v in shape.vertices]
+        return math.ceil(2 * max(abs(o[i] - v[i]) for o in self.samples for v in corners for i in range(3)))
+
+    @cached_property
+    def norm(self) -> Fraction:
+        """max_α Σ_o |mask_α(o)|: no value is larger than this times the largest sample."""
+        return max(sum(map(abs, mask.values()), Fraction(0)) for s in self.shapes for mask in s.masks.values())
+
+    @cached_property
+    def tables(self) -> Tables:
+        """All of it in numbers, on the CPU."""
+        return Tables.of(self)
+
+
+# --- the spline in numbers --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """A spline as tensors.
+
+    Attributes:
+        axes: (3, 8), the cone's axes in space's, for every outcome of `_outcome`; ranks: space's in the cone's.
+        pairs: (9,), of a pair of axes, 3 i + j, the row of a Hessian's xx, xy, xz, yy, yz, zz.
+        barycentric: (S, 4, 4), see `Shape.barycentric`.
+        masks: (R, K), those that differ, in the order of `Spline.samples`.
+        rows: (B, S), which of them a shape's coefficients are, in the order of `multi_indices`.
+        derivatives: of order r = 0, 1, 2: (S·J, B_r), from coefficients of degree r to the J rows of that order, along
+            the axes of the cone.
+        ahead, behind: for each axis of the cone the distinct coordinates of samples, as steps of the index from the
+            cell's along an axis that has, or has not, its direction.
+        which: for each axis of the cone (K,), which of these every sample has.
+    """
+
+    axes: Tensor
+    ranks: Tensor
+    pairs: Tensor
+    barycentric: Tensor
+    masks: Tensor
+    rows: Tensor
+    derivatives: tuple[Tensor, ...]
+    ahead: tuple[Tensor, ...]
+    behind: tuple[Tensor, ...]
+    which: tuple[Tensor, ...]
+
+    @classmethod
+    def of(cls, spline: Spline) -> Tables:
+        indices = multi_indices(spline.degree, 3)
+        distinct: dict[tuple[float, ...], int] = {}
+        rows = [[distinct.setdefault(s.row(a, spline.samples), len(distinct)) for s in spline.shapes] for a in indices]
+        barycentric = np.array([shape.barycentric for shape in spline.shapes], dtype=np.float64)
+        along = [sorted({o[axis] for o in spline.samples}) for axis in range(3)]
+        orders = torch.tensor(_orders()).T
+        return cls(
+            orders,
+            orders.argsort(0),
+            torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5]),
+            torch.tensor(barycentric),
+            torch.tensor(list(distinct), dtype=torch.float64),
+            torch.tensor(rows),
+            tuple(torch.tensor(_derivative_rows(barycentric, spline.degree, order)) for order in range(3)),
+            tuple(torch.tensor([int(spline.shift + o) for o in row]) for row in along),
+            tuple(torch.tensor([int(spline.shift - o) for o in row]) for row in along),
+            tuple(torch.tensor([along[axis].index(o[axis]) for o in spline.samples]) for axis in range(3)),
+        )
+
+    def to(self, device: torch.device) -> Tables:
+        def moved(tensors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            return tuple(t.to(device) for t in tensors)
+
+        return Tables(
+            self.axes.to(device),
+            self.ranks.to(device),
+            self.pairs.to(device),
+            self.barycentric.to(device),
+            self.masks.to(device),
+            self.rows.to(device),
+            moved(self.derivatives),
+            moved(self.ahead),
+            moved(self.behind),
+            moved(self.which),
+        )
+
+
+def _orders() -> list[tuple[int, int, int]]:
+    """The axes by decreasing |coordinate|, for every `_outcome`; for what cannot be as they are."""
+    rows = [(0, 1, 2)] * 8
+    for x, y, z in product(range(3), repeat=3):
+        order = sorted(range(3), key=lambda axis: (-(x, y, z)[axis], axis))
+        rows[4 * (x < y) + 2 * (y < z) + (x < z)] = (order[0], order[1], order[2])
+    return rows
+
+
+def _derivative_rows(barycentric: np.ndarray, degree: int, order: int) -> np.ndarray:
+    """(S·J, B_r): D^i s = n!/(n − r)! Σ_(k_1 … k_r) Π ∂_(i_j) λ_(k_j) · c_(e_k1 + … + e_kr), c of degree r."""
+    place = {alpha: b for b, alpha in enumerate(multi_indices(order, 3))}
+    axes = [pair for pair in product(range(3), repeat=order) if list(pair) == sorted(pair)]
+    rows = np.zeros((len(barycentric), len(axes), len(place)))
+    for (s, slopes), (j, along) in product(enumerate(barycentric[..., 1:]), enumerate(axes)):
+        for vertices in product(range(4), repeat=order):
+            alpha = tuple(vertices.count(k) for k in range(4))
+            rows[s, j, place[alpha]] += math.prod(slopes[k, i] for k, i in zip(vertices, along, strict=True))
+    return math.perm(degree, order) * rows.reshape(-1, len(place))
+
+
+# --- where points are -------------------------------------------------------------------------------------------------
+
+
+def _outcome(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Of comparing |coordinates|: 4 for x < y, 2 for y < z, 1 for x < z."""
+    return 4 * (x < y).long() + 2 * (y < z) + (x < z)
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Where points are.
+
+    Attributes:
+        cell: (3, P) integers.
+        axes: (3, P), axis i of the cone is this one of space; ranks: the inverse.
+        sign: (3, P) of the local coordinates, along the axes of space: −1 or 1.
+        shape: (P,), which one; None where there is but one.
+        barycentric: λ (4, P).
+    """
+
+    cell: Tensor
+    axes: Tensor
+    ranks: Tensor
+    sign: Tensor
+    shape: Tensor | None
+    barycentric: Tensor
+
+
+def locate(spline: Spline, tables: Tables, voxels: Tensor, dtype: torch.dtype) -> Located:
+    """Where voxel coordinates (P, 3) are; local coordinates are taken in their type, and all others in `dtype`."""
+    cell = spline.cells(voxels.detach())
+    local = (voxels - (cell + float(spline.shift))).to(dtype).T
+    outcome = _outcome(*local.abs())
+    axes, ranks = tables.axes.index_select(1, outcome), tables.ranks.index_select(1, outcome)
+    sign = torch.where(local < 0, -1, 1).to(dtype)
+    a, b, c = (local * sign).gather(0, axes)
+    m = tables.barycentric.to(dtype)[..., None]
+    every = m[:, :, 0] + m[:, :, 1] * a + m[:, :, 2] * b + m[:, :, 3] * c  # (S, 4, P)
+    shape = every.detach().amin(1).argmax(0) if len(every) > 1 else None
+    return Located(cell.long().T, axes, ranks, sign, shape, _of_shape(every, shape))
+
+
+def _of_shape(every: Tensor, shape: Tensor | None) -> Tensor:
+    """(S, ..., P) to (..., P): of every point those of its own shape."""
+    if shape is None:
+        return every[0]
+    return every.gather(0, shape.expand(1, *every.shape[1:]))[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Folding:
+    """Which sample stands where, under a boundary.
+
+    Attributes:
+        periods: of samples and partition both along x, y, z; None: samples are constant beyond the ends.
+        ends: (3, 2) even numbers, beyond which points are told apart within one period of the partition only.
+        period: of the partition.
+        lookup: along x, then y, then z: what every index that a point can ask for adds to the flat index.
+        zero: (3,), the place in `lookup` of index 0.
+    """
+
+    periods: Tensor | None
+    ends: Tensor
+    period: int
+    lookup: Tensor
+    zero: Tensor
+
+    @classmethod
+    def of(cls, coefficients: Coefficients, spline: Spline) -> Folding:
+        device, boundary = coefficients.values.device, coefficients.boundary
+        sizes, strides = coefficients.values.shape[:-4:-1], (1, coefficients.values.shape[-1])
+        strides = (*strides, strides[1] * sizes[1])
+        reach = spline.support + 1
+        rows, zero, ends, periods, length = [], [], [], [], 0
+        for n, size, stride in zip(coefficients.size, sizes, strides, strict=True):
+            if boundary.periodic:
+                periods.append(math.lcm(round(boundary.period(n) or 0), spline.period))
+                low, high = -periods[-1], periods[-1]
+            else:
+                low = -2 * math.ceil((coefficients.tail + reach) / 2)
+                high = 2 * math.ceil((n - 1 + coefficients.tail + reach) / 2)
+            ends.append((low, high))
+            index = torch.arange(low - spline.period - reach, high + spline.period + reach + 1)
+            if boundary.periodic:
+                index = boundary.source(index, n)
+            rows.append(stride * (index - coefficients.start).clamp(0, size - 1))
+            zero.append(length + reach + spline.period - low)
+            length += len(rows[-1])
+        return cls(
+            torch.tensor(periods, dtype=torch.float64, device=device) if boundary.periodic else None,
+            torch.tensor(ends, dtype=torch.float64, device=device),
+            spline.period,
+            torch.cat(rows).to(device),
+            torch.tensor(zero, device=device),
+        )
+
+    def near(self, points: Tensor, geometry: Geometry) -> Tensor:
+        """Voxel coordinates of world points (..., 3), moved by whole periods to where `lookup` knows their samples.
+
+        That is exact. Beyond the ends of border and zeros infinity is an even number, as all of the largest are.
+        """
+        voxels = geometry.to_voxel(points)
+        largest = torch.finfo(voxels.dtype).max
+        if not (geometry.is_identity or (plain(points) and all_between(voxels, -largest, largest))):
+            voxels = torch.where(voxels.isfinite(), voxels, far_voxels(points.detach(), geometry, self.periods))
+        if self.periods is not None:
+            return voxels.fmod(self.periods)
+        voxels = torch.where(voxels.abs() > 2.0**60, 2.0**60 * voxels.sign(), voxels)
+        (low, high), within = self.ends.T, voxels.fmod(self.period)
+        return torch.where(voxels < low, low + within, torch.where(voxels > high, high + within, voxels))
+
+    def flat(self, tables: Tables, at: Located) -> Tensor:
+        """(K, P): the flat index of every sample that the points' tetrahedra need."""
+        start = (self.zero[:, None] + at.cell).gather(0, at.axes)
+        forwards = at.sign.gather(0, at.axes) > 0
+        total: Tensor | None = None
+        for axis in range(3):
+            steps = torch.where(forwards[axis], tables.ahead[axis][:, None], tables.behind[axis][:, None])
+            found = self.lookup.index_select(0, (start[axis] + steps).reshape(-1)).reshape(steps.shape)
+            part = found.index_select(0, tables.which[axis])
+            total = part if total is None else total + part
+        assert total is not None
+        return total
+
+
+# --- the scheme -------------------------------------------------------------------------------------------------------
+
+AT_ONCE = 1 << 13
+"""Points whose samples are read together: (K, P) numbers stay in cache."""
+AT_ONCE_ON_A_GPU = 1 << 20
+
+
+@dataclass(frozen=True)
+class OnTetrahedra:
+    """The sum over Bernstein coefficients, made of the samples for every point; in plain torch.
+
+    Attributes:
+        spline: what is summed.
+        terms: none, the value is not separable.
+        exact: not that of the terms.
+    """
+
+    spline: Spline
+    name: str = "direct"
+    gradient: str = "analytic"
+    max_order: int = 2
+    reach: int = 1
+    terms: tuple[Term, ...] = ()
+    exact: bool = False
+
+    def evaluation(self, coefficients: Coefficients, placement: Placement, order: int) -> Evaluation:
+        tables = self.spline.tables.to(coefficients.values.device)
+        folding = Folding.of(coefficients, self.spline)
+        return JetOnTetrahedra(self.spline, tables, folding, coefficients.values, placement, order)
+
+
+@dataclass(frozen=True, eq=False)
+class JetOnTetrahedra:
+    """The jet of a spline of coefficients `values` (N, C, D', H', W') at world points; see `Evaluation`."""
+
+    spline: Spline
+    tables: Tables
+    folding: Folding
+    values: Tensor
+    placement: Placement
+    order: int
+
+    def __call__(self, points: Tensor) -> tuple[Tensor, None]:
+        n, m = points.shape[:2]
+        c = self.values.shape[1]
+        flat = self.values.transpose(0, 1).reshape(c, n * math.prod(self.values.shape[2:]))
+        at_once = AT_ONCE_ON_A_GPU if points.device.type == "cuda" else AT_ONCE
+        parts = []
+        for begin in range(0, max(n * m, 1), at_once):
+            chunk = points.reshape(n * m, 3)[begin : begin + at_once]
+            entry = torch.arange(begin, begin + len(chunk), device=points.device) // m if n > 1 else None
+            parts.append(self._rows(flat, chunk, entry))
+        out = torch.cat(parts, -1) if len(parts) > 1 else parts[0]
+        return out.reshape(c, out.shape[1], n, m).permute(2, 0, 1, 3), None
+
+    def _rows(self, flat: Tensor, points: Tensor, entry: Tensor | None) -> Tensor:
+        """(C, J, P) of points (P, 3) of the entries (P,)."""
+        voxels = self.folding.near(points.to(torch.float64), self.placement.geometry)
+        unknown = voxels.isnan()
+        at = locate(self.spline, self.tables, torch.where(unknown, 0.0, voxels), points.dtype)
+        index = self.folding.flat(self.tables, at)
+        if entry is not None:
+            index = index + entry * math.prod(self.values.shape[2:])
+        samples = flat.index_select(1, index.reshape(-1)).reshape(len(flat), *index.shape).to(points.dtype)
+        rows = torch.cat(self._jet(self.coefficients(samples, at), at), 1)
+        # NaN where a coordinate is, and its derivative by that one; no other has any, nor do the samples
+        poison = (voxels * torch.where(unknown, torch.nan, 0.0)).sum(-1).to(rows.dtype)
+        return torch.where(unknown.any(-1), 0.0, rows) + poison
+
+    def coefficients(self, samples: Tensor, at: Located) -> Tensor:
+        """(C, K, P) to the Bernstein coefficients (C, B, P) of every point's own shape."""
+        found = _product(self.tables.masks, samples)
+        if at.shape is None:
+            return found
+        row = self.tables.rows.index_select(1, at.shape)
+        return found.gather(1, row.expand(len(found), *row.shape))
+
+    def _derivatives(self, order: int, coefficients: Tensor, at: Located) -> Tensor:
+        """(C, B_r, P) to the rows (C, J, P) of that order along the axes of the cone."""
+        found = _product(self.tables.derivatives[order], coefficients)
+        return _of_shape(found.unflatten(1, (len(self.spline.shapes), -1)).transpose(0, 1), at.shape)
+
+    def _jet(self, coefficients: Tensor, at: Located) -> list[Tensor]:
+        """Rows (C, ·, P) of each order, of Bernstein coefficients (C, B, P)."""
+        degree, rows = self.spline.degree, []
+        pieces = coefficients.movedim(1, -1)
+        weights = at.barycentric.T
+        for order in range(min(self.order, degree), -1, -1):
+            steps = bernstein.degree_of(pieces, 3) - order
+            pieces = bernstein.blossom(pieces, [weights] * steps)
+            along_cone = self._derivatives(order, pieces.movedim(-1, 1), at)
+            rows.append(_turned(along_cone, at, order, self.tables.pairs))
+        return rows[::-1]
+
+
+def _product(matrix: Tensor, columns: Tensor) -> Tensor:
+    """(R, Q) times (C, Q, P): (C, R, P). What a point gets depends on no other point: BLAS does not promise that."""
+    matrix = matrix.to(columns.dtype)
+    total = matrix[:, 0, None] * columns[:, 0, None]
+    for q in range(1, columns.shape[1]):
+        total = torch.addcmul(total, matrix[:, q, None], columns[:, q, None])
+    return total
+
+
+def _turned(rows: Tensor, at: Located, order: int, row_of_pair: Tensor) -> Tensor:
+    """Derivatives (C, J, P) of an order along the axes of the cone, along those of space."""
+    if order == 0:
+        return rows
+    if order == 1:
+        return rows.gather(1, at.ranks.expand(rows.shape)) * at.sign
+    pairs = [(i, j) for i in range(3) for j in range(i, 3)]
+    place = torch.stack([3 * at.ranks[i] + at.ranks[j] for i, j in pairs])
+    row = row_of_pair.index_select(0, place.reshape(-1)).reshape(place.shape)
+    return rows.gather(1, row.expand(rows.shape)) * torch.stack([at.sign[i] * at.sign[j] for i, j in pairs])

@@ -1,0 +1,295 @@
+"""Pieces along rays of splines on tetrahedra, and which of their tetrahedra may hold a level; in plain torch.
+
+    ray ─▶ planes that bound cells ─▶ cells that may hold the level ─▶ planes through their centres ─▶ one tetrahedron each
+
+Every face of a tetrahedron lies in a plane n · x = k + offset that bounds cells, or n · (x − centre) = 0. The signed
+permutations of a shape's faces give all normals n, primitive vectors of integers; that some planes go on where no
+tetrahedron has a face there only cuts a piece in two. A piece is in the tetrahedron around its middle; its polynomial is
+the blossom at both of its ends (`bernstein.restrict`), of the degree of the spline.
+
+Source: Kalbe and Zeilfelder 2008, section 5, and the walk through planes instead of projected tetrahedra.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from itertools import permutations, product
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from filterlab import bernstein
+from filterlab.fields.base import Field, Relevant, type_of_rays
+from filterlab.fields.grid import GridField
+from filterlab.fields.tetrahedral import JetOnTetrahedra, Located, OnTetrahedra, Spline, locate
+from filterlab.ops.pieces import Pieces
+from filterlab.ops.reference.pieces import CHUNK, Lines, inside
+
+_ROUNDING = 64  # units of rounding, relative to the largest value, by which bounds of a cell are widened
+
+Normal = tuple[int, int, int]
+T = TypeVar("T", int, Fraction)
+
+
+@dataclass(frozen=True)
+class Planes:
+    """The planes that faces lie in.
+
+    Attributes:
+        outer: (n, offset) of n · x = k + offset, for every integer k.
+        inner: n of n · (x − centre) = 0.
+    """
+
+    outer: tuple[tuple[Normal, float], ...]
+    inner: tuple[Normal, ...]
+
+    @classmethod
+    def of(cls, spline: Spline) -> Planes:
+        outer, inner = set(), set()
+        for shape in spline.shapes:
+            (apex, *sides) = (_primitive(row) for row in shape.barycentric)
+            for turn in _turns():
+                normal, d = _upright(_turned(apex[0], *turn), -apex[1])
+                outer.add((normal, float((sum(normal) * spline.shift + d) % 1)))
+                inner.update(_upright(_turned(normal, *turn), Fraction(0))[0] for normal, _ in sides)
+        return cls(tuple(sorted(outer)), tuple(sorted(inner)))
+
+
+def _primitive(row: tuple[Fraction, ...]) -> tuple[Normal, Fraction]:
+    """(n, d) of d + n · x, with integers n that have no factor in common."""
+    d, *slopes = row
+    factor = Fraction(math.lcm(*(s.denominator for s in slopes)), math.gcd(*(s.numerator for s in slopes)))
+    x, y, z = (int(factor * s) for s in slopes)
+    return (x, y, z), factor * d
+
+
+def _upright(normal: Normal, d: Fraction) -> tuple[Normal, Fraction]:
+    """The same plane n · x = d, of both normals the greater."""
+    x, y, z = normal
+    return max((normal, d), ((-x, -y, -z), -d), key=lambda plane: plane[0])
+
+
+def _turns() -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """The 48 signed permutations: axes of space by axes of the cone, and signs along the axes of space."""
+    return product(permutations(range(3)), product((1, -1), repeat=3))
+
+
+def _turned(vector: tuple[T, T, T], axes: tuple[int, ...], signs: tuple[int, ...]) -> tuple[T, T, T]:
+    out = [vector[0]] * 3
+    for own, axis in zip(vector, axes, strict=True):
+        out[axis] = own * signs[axis]
+    return out[0], out[1], out[2]
+
+
+def tetrahedra(spline: Spline) -> list[tuple[int, tuple[int, ...], tuple[int, ...]]]:
+    """All tetrahedra of a cell, each once: (shape, axes, signs)."""
+    found = {}
+    for number, shape in enumerate(spline.shapes):
+        for axes, signs in _turns():
+            found.setdefault(frozenset(_turned(v, axes, signs) for v in shape.vertices), (number, axes, signs))
+    return list(found.values())
+
+
+class FieldOnTetrahedra(GridField):
+    """A spline on tetrahedra; `relevant` and `pieces_along` are those of its tetrahedra."""
+
+    scheme: OnTetrahedra
+
+    @property
+    def degree_along_rays(self) -> int | None:
+        return self.scheme.spline.degree if self.channels is None else None
+
+    # what programs cast, plain torch casts here
+    first_crossing = Field.first_crossing
+    crossing_candidates = Field.crossing_candidates
+
+    def _most_pieces(self) -> int:
+        planes = self._planes
+        return super()._most_pieces() * (len(planes.inner) + 1)
+
+    @cached_property
+    def _planes(self) -> Planes:
+        return Planes.of(self.scheme.spline)
+
+    def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
+        self._check_pieces()
+        dtype, geometry = type_of_rays(origins, directions), self.domain.geometry
+        own = geometry.to_voxel(origins.detach().double()), geometry.direction_to_voxel(directions.detach().double())
+        x, y, z = (n - 0.5 for n in self.coefficients.size)
+        lines, ray, start = inside(*own, (-0.5, -0.5, -0.5), (x, y, z))
+        line, near, far = _cut(lines, torch.arange(len(ray), device=ray.device), lines.near, lines.far, *self._outer(lines))
+        cells = self._cells(lines, line, near, far)
+        if level is not None:
+            keep = self._may_hold(cells, level, dtype)
+            line, near, far, cells = (x[keep] for x in (line, near, far, cells))
+        line, near, far = _cut(lines, line, near, far, *self._inner(lines, line, cells))
+        coefficients = self._restricted(lines, line, near, far, dtype)
+        return Pieces(ray[line], near, far, _joined(coefficients, line, near, far), start)
+
+    # --- where a ray passes from one polynomial into another ---
+
+    def _outer(self, lines: Lines) -> tuple[Tensor]:
+        """Where lines (L) pass planes that bound cells, (L, K); beyond their ends where there are fewer."""
+        found = []
+        for normal, offset in self._planes.outer:
+            n = lines.origins.new_tensor(normal)
+            place, speed = lines.origins @ n - offset, lines.directions @ n
+            ends = place + speed * lines.near, place + speed * lines.far
+            first, last = torch.minimum(*ends).ceil(), torch.maximum(*ends).floor()
+            count = int((last - first).max()) + 1 if len(first) else 0
+            k = first[:, None] + torch.arange(max(count, 0), device=first.device)
+            s = (k - place[:, None]) / torch.where(speed == 0, 1, speed)[:, None]
+            found.append(torch.where((k <= last[:, None]) & (speed != 0)[:, None], s, torch.inf))
+        return (torch.cat(found, 1),)
+
+    def _inner(self, lines: Lines, line: Tensor, cells: Tensor) -> tuple[Tensor]:
+        """Where they pass planes through the centres of cells (P, 3), (P, M)."""
+        normals = lines.origins.new_tensor(self._planes.inner).T
+        place = (lines.origins[line] - (cells + float(self.scheme.spline.shift))) @ normals
+        speed = (lines.directions @ normals)[line]
+        return (torch.where(speed == 0, torch.inf, -place / torch.where(speed == 0, 1, speed)),)
+
+    def _cells(self, lines: Lines, line: Tensor, near: Tensor, far: Tensor) -> Tensor:
+        """(P, 3), the cell around the middle of every piece."""
+        return self.scheme.spline.cells(lines.chosen(line).at((near + far) / 2))
+
+    # --- polynomials ---
+
+    @property
+    def _jet(self) -> JetOnTetrahedra:
+        return self._own[0]  # type: ignore[return-value]
+
+    def _restricted(self, lines: Lines, line: Tensor, near: Tensor, far: Tensor, dtype: torch.dtype) -> Tensor:
+        """(P, n + 1) Bernstein coefficients along pieces, each within one tetrahedron."""
+        spline, parts = self.scheme.spline, []
+        for part in torch.arange(len(line), device=line.device).split(CHUNK):
+            own, a, b = lines.chosen(line[part]), near[part], far[part]
+            at = locate(spline, self._jet.tables, own.at((a + b) / 2), dtype)
+            coefficients = self._bernstein(at, dtype)
+            ends = (self._barycentric(at, own.at(s), dtype) for s in (a, b))
+            parts.append(bernstein.restrict(coefficients, *ends))
+        return torch.cat(parts) if parts else near.new_zeros((0, spline.degree + 1), dtype=dtype)
+
+    def _barycentric(self, at: Located, voxels: Tensor, dtype: torch.dtype) -> Tensor:
+        """(P, 4) of other points of the same tetrahedra."""
+        local = (voxels - (at.cell.T + float(self.scheme.spline.shift))).T * at.sign
+        rows = self._jet.tables.barycentric  # (S, 4, 4)
+        own = rows[0].expand(len(voxels), 4, 4) if at.shape is None else rows[at.shape]
+        place = local.gather(0, at.axes).T
+        return (own[..., 0] + (own[..., 1:] * place[:, None]).sum(-1)).to(dtype)
+
+    def _bernstein(self, at: Located, dtype: torch.dtype) -> Tensor:
+        """(P, B) coefficients of tetrahedra."""
+        jet, values = self._jet, self.coefficients.values.detach()
+        index = jet.folding.flat(jet.tables, at)
+        samples = values.reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
+        samples = self._decoded_samples(samples, dtype)
+        return jet.coefficients(samples[None], at)[0].T
+
+    def _decoded_samples(self, stored: Tensor, dtype: torch.dtype) -> Tensor:
+        quantization = self.coefficients.quantization
+        scale, shift = (1.0, 0.0) if quantization is None else quantization.numbers()
+        return scale * stored.to(dtype) + shift
+
+    # --- bounds ---
+
+    def _may_hold(self, cells: Tensor, level: float, dtype: torch.dtype) -> Tensor:
+        """Which cells (P, 3) may hold a level: the samples of one, widened by the norm of the spline, straddle it."""
+        low, high, first = self._bounds()
+        x, y, z = (cells - cells.new_tensor(first)).long().unbind(-1)
+        low, high = low[z, y, x], high[z, y, x]
+        middle, half = (low + high) / 2, (high - low) / 2 * float(self.scheme.spline.norm)
+        size = torch.maximum(low.abs(), high.abs())
+        margin = _ROUNDING * torch.finfo(dtype).eps * size
+        return ~((middle - half > level + margin) | (middle + half < level - margin))  # NaN is never left out
+
+    def _bounds(self) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
+        """(least, greatest) sample that each cell from `first` on needs, (D, H, W) float64, and that."""
+        values, spline = self.coefficients.values, self.scheme.spline
+        kept = getattr(self, "_kept_bounds", None)
+        if kept is None or kept[0] != values._version:
+            reach = [int(spline.shift + s * max(abs(c) for o in spline.samples for c in o)) for s in (-1, 1)]
+            first, window = -spline.period, reach[1] - reach[0] + 1
+            every = self._samples(first + reach[0], [n + spline.period + reach[1] for n in self.coefficients.size])
+            low, high = -_pooled(-every, window), _pooled(every, window)
+            kept = values._version, low, high, (first, first, first)
+            self._kept_bounds = kept
+        return kept[1:]
+
+    def _samples(self, first: int, last: list[int]) -> Tensor:
+        """(D, H, W) float64, the samples from `first` to `last` along x, y, z, under the boundary."""
+        folding, flat = self._jet.folding, self.coefficients.values.detach().reshape(-1)
+        x, y, z = (
+            folding.lookup[int(zero) + first : int(zero) + n + 1] for zero, n in zip(folding.zero, last, strict=True)
+        )
+        index = z[:, None, None] + y[:, None] + x
+        return self._decoded_samples(flat[index], torch.float64)
+
+    def relevant(self, level: float) -> Relevant:
+        """Cells whose centres lie in the domain, and tetrahedra of them."""
+        self._check_pieces()
+        spline, device = self.scheme.spline, self.coefficients.values.device
+        axes = [torch.arange(n, dtype=torch.float64, device=device) for n in self.coefficients.size]
+        cells = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        if spline.period == 2:  # of one octahedron for every four voxels
+            cells = cells[(cells % 2 == cells[:, :1] % 2).all(-1)]
+        cells = cells[self._may_hold(cells, level, torch.float64)]
+        total, held = 0, torch.zeros(len(cells), dtype=torch.bool, device=device)
+        for part in torch.arange(len(cells), device=device).split(CHUNK):
+            for which in tetrahedra(spline):
+                low, high = bernstein.bounds(self._bernstein(_placed(cells[part], *which), torch.float64))
+                holds = (low <= level) & (level <= high)
+                held[part] |= holds
+                total += int(holds.sum())
+        return Relevant(int(held.sum()), total)
+
+
+def _placed(cells: Tensor, shape: int, axes: tuple[int, ...], signs: tuple[int, ...]) -> Located:
+    """One tetrahedron of every cell (P, 3); without barycentric coordinates."""
+    count = len(cells)
+
+    def everywhere(row: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        return torch.tensor(row, dtype=dtype, device=cells.device)[:, None].expand(3, count)
+
+    ranks = tuple(axes.index(axis) for axis in range(3))
+    number = torch.full((count,), shape, device=cells.device)
+    return Located(
+        cells.long().T,
+        everywhere(axes, torch.int64),
+        everywhere(ranks, torch.int64),
+        everywhere(signs, torch.float64),
+        number,
+        cells.new_empty(0),
+    )
+
+
+def _cut(
+    lines: Lines, line: Tensor, near: Tensor, far: Tensor, events: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pieces of lines (P), cut at events (P, K) that lie in them: (line, near, far) of those of any length."""
+    inner = torch.minimum(torch.maximum(events, near[:, None]), far[:, None]).sort(1)[0]
+    ends = torch.cat((near[:, None], inner, far[:, None]), 1)
+    a, b = ends[:, :-1], ends[:, 1:]
+    some = b > a
+    some[:, 0] |= far == near  # of a line that touches the domain
+    return line[:, None].expand_as(a)[some], a[some], b[some]
+
+
+def _joined(coefficients: Tensor, line: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    """Neighbours both have the value at their end that the first has."""
+    last = coefficients[:-1, -1]
+    same = (line[1:] == line[:-1]) & (near[1:] == far[:-1]) & last.isfinite()
+    coefficients[1:, 0] = torch.where(same, last, coefficients[1:, 0])
+    return coefficients
+
+
+def _pooled(values: Tensor, window: int) -> Tensor:
+    """The greatest of every window³; NaN where one is."""
+    for dim in range(3):
+        values = values.unfold(dim, window, 1).amax(-1)
+    return values

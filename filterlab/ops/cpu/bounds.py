@@ -1,0 +1,75 @@
+"""Bounds of the polynomials on cells as vector code: describes lattices to the program of `ops.cpu.hulls`.
+
+Memory beyond the result: for parts of more than one cell 4 bytes for every cell of a few layers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from filterlab.ops.bounds import Bounds, Codes
+from filterlab.ops.cpu import compiler
+from filterlab.ops.cpu import threads as pool
+from filterlab.ops.cpu.hulls import HullsJob, HullsVariant
+from filterlab.ops.cpu.machine import lanes_of
+from filterlab.ops.gather import STORAGE, in_whole_rows
+from filterlab.ops.pieces import Lattice
+
+_LAYERS = 32  # of cells at a time, where they are joined to parts
+
+
+def bounds(lattice: Lattice, edge: int, codes: Codes) -> Bounds:
+    """`ops.reference.bounds.bounds`, fused."""
+    depth = lattice.cells[2]
+    step = depth if edge == 1 else _LAYERS
+    parts = [_of_layers(lattice, codes, z, min(step, depth - z)) for z in range(0, depth, step)]
+    lows, highs, ends = zip(*parts, strict=True)
+    low, high = (
+        torch.from_numpy(np.concatenate([_joined(x, edge, least) for x in own]))
+        for own, least in ((lows, np.minimum), (highs, np.maximum))
+    )
+    return Bounds(low, high, (min(e[0] for e in ends), max(e[1] for e in ends)))
+
+
+def _of_layers(
+    lattice: Lattice, codes: Codes, first: int, depth: int
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """Of single cells."""
+    coefficients = in_whole_rows(lattice.coefficients)[first:]
+    plane, row, _ = coefficients.stride()
+    width, height, _ = lattice.cells
+    lanes = lanes_of(torch.float64)
+    job = HullsJob(
+        width=row,
+        height=plane // row,
+        cells_x=width,
+        cells_y=height,
+        factor=lattice.scale / codes.step,
+        offset=(lattice.shift - codes.start) / codes.step,
+        next=0,
+        chunks=depth,
+    )
+    low, high = (np.empty((depth, height, width), np.int16) for _ in range(2))
+    ends = np.empty((2, depth, lanes))
+    job.point(coefficients=coefficients, low=low, high=high, least=ends[0], most=ends[1])
+    function = compiler.compiled(_variant(lattice, coefficients, lanes))
+    pool.run(function, [job] * max(1, min(torch.get_num_threads(), depth)))
+    least, most = sorted(lattice.scale * float(x) + lattice.shift for x in (ends[0].min(), ends[1].max()))
+    return low, high, (least, most)
+
+
+def _variant(lattice: Lattice, coefficients: Tensor, lanes: int) -> HullsVariant:
+    return HullsVariant(lattice.stencil.lowered, lattice.degrees, STORAGE[coefficients.dtype], lanes)
+
+
+def _joined(cells: np.ndarray, edge: int, least: np.ufunc) -> np.ndarray:
+    """The least (or greatest) of every `edge`³ cells, an edge of 1 or 2; fewer at the ends."""
+    for axis in range(3 if edge == 2 else 0):
+        rows = cells.swapaxes(0, axis)
+        joined = rows[::2].copy()
+        second = rows[1::2]
+        least(joined[: len(second)], second, out=joined[: len(second)])
+        cells = joined.swapaxes(0, axis)
+    return cells

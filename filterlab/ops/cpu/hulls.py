@@ -1,0 +1,188 @@
+"""The program that bounds the polynomials on cells: coefficients in, codes of the least and the greatest out.
+
+For P cells of a row at a time: in every plane of taps sums along x and y, to Bernstein coefficients in x and y of the
+plane, which are kept in memory; then, for each of these, sums along z over the planes, of which none is kept.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import comb
+from types import SimpleNamespace
+
+from llvmlite import ir
+
+from filterlab.ops.bounds import CODES
+from filterlab.ops.cpu import frame, job
+from filterlab.ops.cpu.lanes import DOUBLE, I16, I32, I64, STORAGE, Lanes, Value
+from filterlab.ops.stencil import Lowered
+
+# Arrays are contiguous; d is a double.
+FIELDS: dict[str, type] = {
+    "next": ctypes.c_int64,  # the layer to be taken next; threads add 1 atomically
+    "coefficients": ctypes.c_void_p,  # the first tap of the first cell; rows together, planes as many rows as `height`
+    "width": ctypes.c_int64,
+    "height": ctypes.c_int64,
+    "cells_x": ctypes.c_int64,  # their number; at least P are written, fewer are not
+    "cells_y": ctypes.c_int64,
+    "factor": ctypes.c_double,  # the code is ⌊factor · sum + offset⌋, if that is one
+    "offset": ctypes.c_double,
+    "low": ctypes.c_void_p,  # (layers, cells_y, cells_x) 16 bits, written
+    "high": ctypes.c_void_p,
+    "least": ctypes.c_void_p,  # (layers, P) d, written: of those of a layer that are finite
+    "most": ctypes.c_void_p,
+    "chunks": ctypes.c_int64,  # `next` stops here: layers
+}
+
+
+class HullsJob(job.Job):
+    _fields_ = tuple(FIELDS.items())
+
+
+@dataclass(frozen=True)
+class HullsVariant:
+    """Everything the program depends on, apart from the machine.
+
+    Attributes:
+        stencil: the sum over taps, one row.
+        degrees: of a cell's polynomial in x, y, z.
+        storage: dtype of the coefficients.
+        lanes: P.
+    """
+
+    stencil: Lowered
+    degrees: tuple[int, int, int]
+    storage: str
+    lanes: int
+
+    def generate(self) -> str:
+        """The program as LLVM IR text."""
+        module, function = frame.new_module()
+        _Program(self, function).write()
+        return str(module)
+
+
+class _Program:
+    def __init__(self, variant: HullsVariant, function: ir.Function) -> None:
+        self.variant, self.storage = variant, STORAGE[variant.storage]
+        self.builder = ir.IRBuilder(function.append_basic_block("entry"))
+        self.lanes = Lanes(self.builder, "float64", variant.lanes)
+        self.job: SimpleNamespace = frame.load_job(self.lanes, function.args[0], FIELDS)
+        self.weights = [
+            [[_bernstein(row, degree) for row in table] for table in tables]
+            for tables, degree in zip(variant.stencil.functions, variant.degrees, strict=True)
+        ]
+        self.planes = list(dict.fromkeys((a, b) for _, a, b, _ in variant.stencil.rows[0]))
+        self.columns = (variant.degrees[0] + 1) * (variant.degrees[1] + 1)
+
+    def write(self) -> None:
+        e, b, j = self.lanes, self.builder, self.job
+        depth = self.variant.stencil.supports[2]
+        self.kept = e.reserve(e.pack, len(self.planes) * self.columns * depth)
+        never = e.constant(math.inf)
+        self.low, self.high, self.total, self.least, self.most = (e.variable(never) for _ in range(5))
+        packs = b.udiv(b.add(j.cells_x, I64(e.count - 1)), I64(e.count))
+        with frame.every_chunk(e, j) as z:
+            self.least.value, self.most.value = never, e.constant(-math.inf)
+            with e.repeat(I64(0), j.cells_y) as y, e.repeat(I64(0), packs) as pack:
+                self._cells(z, y, b.mul(pack, I64(e.count)))
+            place = b.mul(z, I64(e.count))
+            e.store(self.least.value, e.advance(j.least, place, DOUBLE))
+            e.store(self.most.value, e.advance(j.most, place, DOUBLE))
+        b.ret_void()
+
+    def _cells(self, z: Value, y: Value, x: Value) -> None:
+        """A pack of them, from x on; of the last of a row some are bounded twice."""
+        e, b, j = self.lanes, self.builder, self.job
+        x = e.smaller(x, b.sub(j.cells_x, I64(e.count)))
+        self.low.value, self.high.value = e.constant(math.inf), e.constant(-math.inf)
+        self.total.value = e.constant(0)
+        with e.repeat(I64(0), I64(self.variant.stencil.supports[2])) as dz:
+            row = b.add(b.mul(b.add(z, dz), j.height), y)
+            for place, pack in enumerate(self._of_plane(row, x)):
+                e.store(pack, self._place(I64(place), dz))
+        with e.repeat(I64(0), I64(self.columns)) as column:
+            self._bound(self._along_z(column))
+        self._write(b.add(b.mul(b.add(b.mul(z, j.cells_y), y), j.cells_x), x))
+
+    def _of_plane(self, row: Value, x: Value) -> Iterator[Value]:
+        """Coefficients in x and y of a plane of taps, for all that is summed of it: x runs fastest, then y."""
+        b, v = self.builder, self.variant
+        planes: dict[tuple[int, int, int, int], Value] = {}
+        for dy in range(v.stencil.supports[1]):
+            first = b.add(b.mul(b.add(row, I64(dy)), self.job.width), x)
+            line = [self._load(b.add(first, I64(t))) for t in range(v.stencil.supports[0])]
+            along = {a: self._sums(line, self.weights[0][a]) for a in dict.fromkeys(a for a, _ in self.planes)}
+            for a, f in self.planes:
+                for k, weight in enumerate(self.weights[1][f][dy]):
+                    for i, pack in enumerate(along[a]):
+                        planes[a, f, k, i] = self._added(planes.get((a, f, k, i)), weight, pack)
+        for a, f in self.planes:
+            for k in range(v.degrees[1] + 1):
+                for i in range(v.degrees[0] + 1):
+                    yield planes[a, f, k, i]
+
+    def _load(self, index: Value) -> Value:
+        e, storage = self.lanes, self.storage
+        return e.convert(e.load(e.advance(self.job.coefficients, index, storage.raw), storage.raw, e.count), storage)
+
+    def _sums(self, taps: Sequence[Value], weights: Sequence[Sequence[float]]) -> list[Value]:
+        """Σ_t weights[t][i] · tap t, for every i."""
+        found: list[Value] = []
+        for row in zip(*weights, strict=True):
+            total = self.lanes.constant(0)
+            for weight, tap in zip(row, taps, strict=True):
+                total = self._added(total, weight, tap)
+            found.append(total)
+        return found
+
+    def _added(self, total: Value | None, weight: float, pack: Value) -> Value:
+        e = self.lanes
+        total = e.constant(0) if total is None else total
+        return e.multiply_add(pack, e.constant(weight), total) if weight else total
+
+    def _place(self, place: Value, dz: Value) -> Value:
+        b, depth = self.builder, self.variant.stencil.supports[2]
+        return self.lanes.advance(self.kept, b.add(b.mul(place, I64(depth)), dz), self.lanes.pack)
+
+    def _along_z(self, column: Value) -> list[Value]:
+        """Coefficients along z, of one in x and y."""
+        e, b, v = self.lanes, self.builder, self.variant
+        found = [e.constant(0)] * (v.degrees[2] + 1)
+        for factor, a, f, c in v.stencil.rows[0]:
+            place = b.add(column, I64(self.planes.index((a, f)) * self.columns))
+            for dz, weights in enumerate(self.weights[2][c]):
+                pack = e.load(self._place(place, I64(dz)), DOUBLE, e.count)
+                found = [self._added(t, factor * w, pack) for t, w in zip(found, weights, strict=True)]
+        return found
+
+    def _bound(self, coefficients: Sequence[Value]) -> None:
+        e = self.lanes
+        for variable, own in ((self.low, e.minimum), (self.high, e.maximum), (self.total, e.add)):
+            value = variable.value
+            for c in coefficients:
+                value = own(value, c)
+            variable.value = value
+
+    def _write(self, place: Value) -> None:
+        e, b, j = self.lanes, self.builder, self.job
+        whole = b.fcmp_ordered("<", e.absolute(self.total.value), e.constant(math.inf))
+        low, high = self.low.value, self.high.value
+        self.least.value = e.where(whole, e.minimum(low, self.least.value), self.least.value)
+        self.most.value = e.where(whole, e.maximum(high, self.most.value), self.most.value)
+        factor, offset = e.everywhere(j.factor), e.everywhere(j.offset)
+        first, second = (e.multiply_add(x, factor, offset) for x in (low, high))
+        ends = (j.low, e.minimum(first, second), 0), (j.high, e.maximum(first, second), CODES - 1)
+        for array, value, if_none in ends:
+            code = e.clamp(e.where(whole, e.floor(value), e.constant(if_none)), e.constant(0), e.constant(CODES - 1))
+            code = b.sub(e.to_integer(code), ir.Constant(ir.VectorType(I32, e.count), [CODES // 2] * e.count))
+            e.store(b.trunc(code, ir.VectorType(I16, e.count)), e.advance(array, place, I16))
+
+
+def _bernstein(monomial: Sequence[float], degree: int) -> list[float]:
+    """b_i = Σ_k a_k binom(i, k) / binom(n, k)."""
+    n = degree
+    return [sum(a * comb(i, k) / comb(n, k) for k, a in enumerate(monomial) if k <= i) for i in range(n + 1)]

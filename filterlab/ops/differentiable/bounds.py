@@ -1,0 +1,43 @@
+"""Bounds of the polynomials on cells: what computes them. They have no derivatives."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from filterlab.ops import cpu
+from filterlab.ops.bounds import Bounds, Codes
+from filterlab.ops.cpu.machine import lanes_of
+from filterlab.ops.differentiable.drivers import driver
+from filterlab.ops.gather import STORAGE
+from filterlab.ops.pieces import Lattice
+
+_FEWEST = 1 << 16
+"""Cells from which on a program is worth to be compiled: plain torch takes 20 to 500 ns for each."""
+
+
+def missing(lattice: Lattice) -> str | None:
+    """What keeps the program from running here; None: nothing does."""
+    if problem := cpu.llvmlite_problem():
+        return problem
+    c = lattice.coefficients
+    if c.device.type != "cpu" or c.dtype not in STORAGE:
+        return f"it reads {', '.join(STORAGE.values())} on the CPU; got {c.dtype} on {c.device}"
+    if lattice.cells[0] < lanes_of(torch.float64):
+        return f"it bounds {lanes_of(torch.float64)} cells of a row at a time; got {lattice.cells[0]}"
+    if not lattice.exact:
+        return "its kernels are tables that are written into the program; got tensors"
+    return None
+
+
+def bounds(lattice: Lattice, edge: int, codes: Codes, implementation: str | None = None) -> Bounds:
+    """Those of parts of `edge`³ cells, an edge of 1 or 2.
+
+    Args:
+        implementation: "reference" or "cpu"; None: the faster one that can run.
+    """
+    if implementation is None:
+        many = math.prod(lattice.cells) >= _FEWEST
+        implementation = "cpu" if many and missing(lattice) is None else "reference"
+    return driver(implementation, "bounds").bounds(lattice, edge, codes)
