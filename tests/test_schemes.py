@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from filterlab.fields import tensor_product
 from filterlab.fields.base import Field
 from filterlab.fields.tensor_product import SAMPLERS, exact_sample
 from filterlab.kernels import bc
@@ -80,6 +81,24 @@ def test_the_number_of_samples_is_the_paper_s(method, value, value_and_gradient)
         counted.clear()
         field.jet(points(), order)
         assert sum(counted) == expected * 60
+
+
+@every_sampled
+def test_few_samples_are_taken_in_one_call_and_have_the_bits_of_many(method, monkeypatch):
+    calls = []
+
+    def counting(coefficients, at):
+        calls.append(at.shape[1])
+        return exact_sample(coefficients, at)
+
+    field, at, jets = sampled(volume(), method, sampler=counting), points().float(), []
+    for few, each in ((0, 1), (tensor_product._FEW, 7 if METHODS[method].sampled_gradient == "central" else 8)):
+        calls.clear()
+        monkeypatch.setattr(tensor_product, "_FEW", few)
+        jets.append(field.jet(at, 1))
+        assert set(calls) == {each * len(at)}
+    for one_by_one, together in zip(*jets, strict=True):
+        assert torch.equal(one_by_one, together)
 
 
 @every_sampled

@@ -9,10 +9,10 @@ texture unit.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, wraps
-from itertools import product
+from itertools import chain, product
 from typing import Any, TypeVar
 
 import torch
@@ -240,15 +240,30 @@ def _at_corners(
     x: tuple[Tensor, Tensor],
     y: tuple[Tensor, Tensor],
     z: tuple[Tensor, Tensor],
-) -> list[Tensor]:
+) -> Sequence[Tensor]:
     """The eight samples at all combinations of two positions per axis; x varies fastest. Each pair holds (N, M, 3)."""
-    return [
-        sample(coefficients, torch.stack((x[i][..., 0], y[j][..., 1], z[k][..., 2]), -1))
-        for k, j, i in product(range(2), repeat=3)
-    ]
+    corners = product(range(2), repeat=3)
+    places = (torch.stack((x[i][..., 0], y[j][..., 1], z[k][..., 2]), -1) for k, j, i in corners)
+    return samples_at(sample, coefficients, places)
 
 
-def _combine(samples: list[Tensor], weights: list[Tensor]) -> Tensor:
+_FEW = 1 << 15
+
+
+def samples_at(sample: Sampler, coefficients: Coefficients, places: Iterable[Tensor]) -> Sequence[Tensor]:
+    """Samples (N, C, M) at each of the places (N, M, 3).
+
+    Few in one call, as then calls are what takes the time; else one after the other, as then places take memory.
+    """
+    places = iter(places)
+    first = next(places)
+    if first.numel() > _FEW:
+        return [sample(coefficients, place) for place in chain((first,), places)]
+    together = [first, *places]
+    return sample(coefficients, torch.cat(together, 1)).chunk(len(together), -1)
+
+
+def _combine(samples: Sequence[Tensor], weights: list[Tensor]) -> Tensor:
     """Σ over the eight corners, along x, then y, then z; weights[axis] is (2, N, M, 3)."""
     for axis in range(3):
         low, high = (w[..., axis][:, None] for w in weights[axis])  # (N, 1, M): over channels
@@ -269,18 +284,22 @@ class TrilinearCentral(Sampled):
 
     @with_exact_positions
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
-        value = self.sample(coefficients, points)
         if order == 0:
-            return value[:, :, None]
-        return with_central_differences(value, *unit_steps(self.sample, coefficients, points))
+            return self.sample(coefficients, points)[:, :, None]
+        return with_central_differences(*unit_steps(self.sample, coefficients, points))
 
 
-def unit_steps(sample: Sampler, coefficients: Coefficients, points: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-    """Trilinear samples one voxel ahead and one behind along x, y and z."""
+def unit_steps(
+    sample: Sampler, coefficients: Coefficients, points: Tensor
+) -> tuple[Tensor, Sequence[Tensor], Sequence[Tensor]]:
+    """Trilinear samples at the points, and one voxel ahead and one behind along x, y and z."""
     steps = torch.eye(3, dtype=points.dtype, device=points.device)
-    return [sample(coefficients, points + s) for s in steps], [sample(coefficients, points - s) for s in steps]
+    here, *around = samples_at(
+        sample, coefficients, chain((points,), (points + s for s in steps), (points - s for s in steps))
+    )
+    return here, around[:3], around[3:]
 
 
-def with_central_differences(value: Tensor, ahead: list[Tensor], behind: list[Tensor]) -> Tensor:
+def with_central_differences(value: Tensor, ahead: Sequence[Tensor], behind: Sequence[Tensor]) -> Tensor:
     """The rows of a jet of order 1: the value (N, C, M), and half the difference of the samples along each axis."""
     return torch.stack([value, *((a - b) / 2 for a, b in zip(ahead, behind, strict=True))], 2)

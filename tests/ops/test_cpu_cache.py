@@ -413,6 +413,38 @@ def test_programs_of_another_memory_layout_are_not_found(folder: Path, tmp_path:
     assert here["told"]() == (12, 0, expected)
 
 
+FAR_APART = """
+import ctypes
+from filterlab.ops.cpu import compiler
+libc = ctypes.CDLL(None)
+libc.mmap.restype = ctypes.c_void_p
+libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
+
+def mapped(size):
+    return libc.mmap(None, size, 0, 0x4022, -1, 0)  # private, anonymous, not reserved
+
+print(value())
+vast, pages = mapped(3 << 30), []
+while not pages or pages[-1] > vast:
+    pages.append(mapped(4096))
+libc.munmap(pages[-2], 4096)
+kept = dict(compiler._programs)
+compiler._programs.clear()
+print(value())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is mapped without being reserved on Linux only")
+def test_a_program_is_loaded_where_its_parts_lie_far_apart(folder: Path) -> None:
+    """One page of room above 3 GiB that are taken, the rest below: once this ended the process."""
+    once = PROGRAM.replace("print(", "value = lambda: (")
+    done = subprocess.run([sys.executable, "-c", once + FAR_APART], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    first, again = done.stdout.split()
+    assert first == again
+
+
 def test_two_processes_at_once(folder: Path) -> None:
     command = [sys.executable, "-c", PROGRAM]
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]

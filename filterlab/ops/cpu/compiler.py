@@ -100,6 +100,10 @@ def _files(package: Traversable) -> Iterator[tuple[str, Traversable]]:
 
 
 def _machine() -> llvm.TargetMachine:
+    """Code finds its constants by addresses of 64 bits: LLVM loads both wherever there is room, and where that is more
+    than 2 GiB apart, beyond and before a large volume, it would end the process. On ARM llvmlite loads them together.
+    """
+    x86 = llvm.get_process_triple().startswith(("x86_64", "amd64"))
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm.Target.from_triple(llvm.get_process_triple()).create_target_machine(
@@ -107,7 +111,7 @@ def _machine() -> llvm.TargetMachine:
         features=llvm.get_host_cpu_features().flatten(),
         opt=3,
         reloc="pic",
-        codemodel="small",
+        codemodel="large" if x86 else "small",
         jit=True,
     )
 
