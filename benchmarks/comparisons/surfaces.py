@@ -28,6 +28,7 @@ SEARCHED = tuple(name for name in METHODS if tensor_product(name))
 """Methods whose level sets are found."""
 
 _BARS = {"trilinear": at_most("0.25"), "triquadratic": at_most("0.45"), "tricubic": at_most("0.9")}
+_TILED = f"{mitsuba_sdfgrid.NAME}, tile by tile"
 _PROCESSES = 3  # of which the peak memory is taken
 _PLAIN = 64  # pixels along an edge of what plain torch casts
 
@@ -75,6 +76,8 @@ def _first(settings: Settings) -> Race:
         contestants.append(peer.casting(task))
     if mitsuba_sdfgrid.NAME not in absent:
         ratios += [Ratio(method, mitsuba_sdfgrid.NAME, bar) for method, bar in _BARS.items()]
+        contestants.append(replace(mitsuba_sdfgrid.casting(task.tile_by_tile()), name=_TILED))
+        ratios += [Ratio(method, _TILED) for method in _BARS]
     if embree_mesh.NAME not in absent:
         ratios.append(Ratio("triquadratic", embree_mesh.NAME, at_most("2")))
     what = f"{described(task)}: first hits and normals; {embree_mesh.NAME} without"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 
 import numpy as np
 from torch import Tensor
+
+from filterlab.render.tiles import tiled
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,13 @@ class Casting:
     def flat(self) -> tuple[np.ndarray, np.ndarray]:
         """Origins and directions (R, 3), one after the other."""
         return self.origins.reshape(-1, 3).numpy(), self.directions.reshape(-1, 3).numpy()
+
+    def tile_by_tile(self) -> Casting:
+        """The same rays in another order, for peers that take them as they come: of 4×4 pixels, of 16×16 of these."""
+        height, width = self.origins.shape[:2]
+        order = tiled(height, width, self.origins.device)
+        origins, directions = (x.reshape(-1, 3)[order].reshape(x.shape) for x in (self.origins, self.directions))
+        return replace(self, origins=origins, directions=directions)
 
     @staticmethod
     def summary(t: np.ndarray) -> tuple[np.ndarray, ...]:
