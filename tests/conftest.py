@@ -31,8 +31,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Half a million objects are there to stay: walking them takes the garbage collector 0.4 s each time."""
+    """Half a million objects are there to stay, and what tests import too: walking them all takes 0.2 to 0.4 s a time."""
     gc.freeze()
+    young, middle, _ = gc.get_threshold()
+    gc.set_threshold(young, middle, 50)
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
