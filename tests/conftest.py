@@ -31,7 +31,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Half a million objects are there to stay, and what tests import too: walking them all takes 0.2 to 0.4 s a time."""
+    """Half a million objects are there to stay, and what tests import too: to walk them all takes 0.2 to 0.4 s."""
     gc.freeze()
     young, middle, _ = gc.get_threshold()
     gc.set_threshold(young, middle, 50)
