@@ -100,6 +100,21 @@ def test_no_piece_that_may_hold_the_level_is_left_out(name):
     assert len(field.pieces_along(origins, directions, 999.0).ray) == 0
 
 
+@every_spline
+def test_bounds_are_those_of_the_samples_that_are_there(name):
+    """Of others that a copy of the field got, of those that were written since, of those that count no writing."""
+    ray = torch.tensor([[2.2, 2.1, -3.0]], dtype=torch.float64), torch.tensor([[0.0, 0.1, 1.0]], dtype=torch.float64)
+    count = lambda field: len(field.pieces_along(*ray, 0.5).ray)  # noqa: E731
+    expected = count(fl.reconstruct(samples(6, 6, 6), name))
+    dark, bright = (fl.reconstruct(v, name) for v in (torch.zeros(6, 6, 6, dtype=torch.float64), samples(6, 6, 6)))
+    assert (count(dark), expected > 0) == (0, True)
+    assert count(dark.with_tensors([bright.coefficients.values])) == expected
+    dark.coefficients.values.copy_(bright.coefficients.values)
+    assert count(dark) == expected
+    with torch.inference_mode():
+        assert count(fl.reconstruct(samples(6, 6, 6).clone(), name)) == expected
+
+
 # ---- hits
 
 

@@ -34,6 +34,8 @@ _ROUNDING = 64  # units of rounding, relative to the largest value, by which bou
 
 Normal = tuple[int, int, int]
 T = TypeVar("T", int, Fraction)
+Bounds = tuple[Tensor, Tensor, int]
+"""The least and the greatest sample that each cell needs, (D, H, W) float64, and the first cell along every axis."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,11 @@ class FieldOnTetrahedra(GridField):
     """A spline on tetrahedra; `relevant` and `pieces_along` are those of its tetrahedra."""
 
     scheme: OnTetrahedra
+    _kept: tuple[int, Bounds] | None
+
+    def _settle(self) -> None:
+        super()._settle()
+        self._kept = None  # a copy has other coefficients
 
     @property
     def degree_along_rays(self) -> int | None:
@@ -202,25 +209,28 @@ class FieldOnTetrahedra(GridField):
     def _may_hold(self, cells: Tensor, level: float, dtype: torch.dtype) -> Tensor:
         """Which cells (P, 3) may hold a level: the samples of one, widened by the norm of the spline, straddle it."""
         low, high, first = self._bounds()
-        x, y, z = (cells - cells.new_tensor(first)).long().unbind(-1)
+        x, y, z = (cells - first).long().unbind(-1)
         low, high = low[z, y, x], high[z, y, x]
         middle, half = (low + high) / 2, (high - low) / 2 * float(self.scheme.spline.norm)
         size = torch.maximum(low.abs(), high.abs())
         margin = _ROUNDING * torch.finfo(dtype).eps * size
         return ~((middle - half > level + margin) | (middle + half < level - margin))  # NaN is never left out
 
-    def _bounds(self) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
-        """(least, greatest) sample that each cell from `first` on needs, (D, H, W) float64, and that."""
-        values, spline = self.coefficients.values, self.scheme.spline
-        kept = getattr(self, "_kept_bounds", None)
-        if kept is None or kept[0] != values._version:
-            reach = [int(spline.shift + s * max(abs(c) for o in spline.samples for c in o)) for s in (-1, 1)]
-            first, window = -spline.period, reach[1] - reach[0] + 1
-            every = self._samples(first + reach[0], [n + spline.period + reach[1] for n in self.coefficients.size])
-            low, high = -_pooled(-every, window), _pooled(every, window)
-            kept = values._version, low, high, (first, first, first)
-            self._kept_bounds = kept
-        return kept[1:]
+    def _bounds(self) -> Bounds:
+        """Kept for as long as the field has these coefficients and they are not written to."""
+        values = self.coefficients.values
+        if values.is_inference():  # it does not count how often it is written to
+            return self._made_bounds()
+        if self._kept is None or self._kept[0] != values._version:
+            self._kept = values._version, self._made_bounds()
+        return self._kept[1]
+
+    def _made_bounds(self) -> Bounds:
+        spline = self.scheme.spline
+        reach = [int(spline.shift + s * max(abs(c) for o in spline.samples for c in o)) for s in (-1, 1)]
+        first, window = -spline.period, reach[1] - reach[0] + 1
+        every = self._samples(first + reach[0], [n + spline.period + reach[1] for n in self.coefficients.size])
+        return -_pooled(-every, window), _pooled(every, window), first
 
     def _samples(self, first: int, last: list[int]) -> Tensor:
         """(D, H, W) float64, the samples from `first` to `last` along x, y, z, under the boundary."""

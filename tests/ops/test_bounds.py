@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -36,6 +38,23 @@ def assert_alike(lattice: Lattice) -> None:
             assert int(difference.max()) <= 1
             assert float((difference > 0).double().mean()) < 1e-3
         assert len(fused.high.unique()) > 20
+
+
+WITHOUT_LLVMLITE = """
+import sys
+sys.modules["llvmlite"] = None
+import torch, filterlab as fl
+from filterlab.surfaces import LevelSet
+volume = torch.arange(6.0)[:, None, None].expand(6, 6, 6)
+ray = torch.tensor([2.2, 2.1, -3.0]), torch.tensor([0.0, 0.0, 1.0])
+print(float(LevelSet(fl.reconstruct(volume, "trilinear"), 2.5).hit(*ray).t))
+"""
+
+
+def test_level_sets_are_found_without_llvmlite():
+    done = subprocess.run([sys.executable, "-c", WITHOUT_LLVMLITE], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) == 5.5
 
 
 @pytest.mark.parametrize("boundary", ["mirror", "zeros"])

@@ -8,7 +8,6 @@ import torch
 
 from filterlab.ops import cpu
 from filterlab.ops.bounds import Bounds, Codes
-from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.gather import STORAGE
 from filterlab.ops.pieces import Lattice
@@ -24,8 +23,11 @@ def missing(lattice: Lattice) -> str | None:
     c = lattice.coefficients
     if c.device.type != "cpu" or c.dtype not in STORAGE:
         return f"it reads {', '.join(STORAGE.values())} on the CPU; got {c.dtype} on {c.device}"
-    if lattice.cells[0] < lanes_of(torch.float64):
-        return f"it bounds {lanes_of(torch.float64)} cells of a row at a time; got {lattice.cells[0]}"
+    from filterlab.ops.cpu.machine import lanes_of  # it needs llvmlite, and has been imported with it
+
+    least = lanes_of(torch.float64)
+    if lattice.cells[0] < least:
+        return f"it bounds {least} cells of a row at a time; got {lattice.cells[0]}"
     if not lattice.exact:
         return "its kernels are tables that are written into the program; got tensors"
     return None
