@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
-from itertools import permutations, product
 from typing import Annotated, Literal
 
 import numpy as np
@@ -26,7 +25,7 @@ from experiments.config import ExperimentConfig
 from experiments.runs import Record, Run, Unit
 from filterlab import bernstein
 from filterlab.bernstein import multi_indices
-from filterlab.fields.tetrahedral import Shape, Spline
+from filterlab.fields.tetrahedral import Shape, Spline, Turn, Vector
 from filterlab.io.config import unknown_name
 from filterlab.methods import METHODS, Tetrahedral
 
@@ -100,20 +99,20 @@ class Piece:
     Attributes:
         kind: the number of its shape.
         shape: that it is the image of.
-        matrix: the signed permutation that maps the shape to it.
+        turn: maps the shape to it.
     """
 
     kind: int
     shape: Shape
-    matrix: np.ndarray
+    turn: Turn
 
     @property
     def vertices(self) -> np.ndarray:
-        return np.array([self._image(v) for v in self.shape.vertices], dtype=np.float64)
+        return np.array([self.turn(v) for v in self.shape.vertices], dtype=np.float64)
 
     @property
     def samples(self) -> Iterator[tuple[Fraction, ...]]:
-        return (self._image(place) for mask in self.shape.masks.values() for place in mask)
+        return (self.turn(place) for mask in self.shape.masks.values() for place in mask)
 
     @property
     def domain_points(self) -> Iterator[tuple[Fraction, ...]]:
@@ -121,7 +120,8 @@ class Piece:
         for alpha in self.shape.masks:
             axes = zip(*self.shape.vertices, strict=True)
             point = tuple(sum((n * c for n, c in zip(alpha, row, strict=True)), Fraction()) for row in axes)
-            yield self._image(tuple(c / sum(alpha) for c in point))
+            x, y, z = (c / sum(alpha) for c in point)
+            yield self.turn((x, y, z))
 
     def coefficients(self, samples: np.ndarray, centre: np.ndarray) -> np.ndarray:
         """Bernstein coefficients in the order of `multi_indices`, of samples [x, y, z] about a centre."""
@@ -129,27 +129,14 @@ class Piece:
         masks = (self.shape.masks[alpha] for alpha in multi_indices(degree, 3))
         return np.array([sum(float(w) * samples[self._index(place, centre)] for place, w in m.items()) for m in masks])
 
-    def _index(self, place: tuple[Fraction, ...], centre: np.ndarray) -> tuple[int, ...]:
-        return tuple(int(n) for n in centre + np.array(self._image(place), dtype=np.float64))
-
-    def _image(self, v: tuple[Fraction, ...]) -> tuple[Fraction, ...]:
-        return tuple(sum((int(m) * c for m, c in zip(row, v, strict=True)), Fraction()) for row in self.matrix)
+    def _index(self, place: Vector, centre: np.ndarray) -> tuple[int, ...]:
+        return tuple(int(n) for n in centre + np.array(self.turn(place), dtype=np.float64))
 
 
 @cache
 def pieces_of(spline: Spline) -> list[Piece]:
     """All tetrahedra of a cell, each once."""
-    found: dict[frozenset[tuple[float, ...]], Piece] = {}
-    for kind, shape in enumerate(spline.shapes):
-        for matrix in _signed_permutations():
-            piece = Piece(kind, shape, matrix)
-            found.setdefault(frozenset(map(tuple, piece.vertices)), piece)
-    return list(found.values())
-
-
-def _signed_permutations() -> Iterator[np.ndarray]:
-    rows = (np.eye(3, dtype=int)[list(order)] for order in permutations(range(3)))
-    return (np.diag(signs) @ row for row in rows for signs in product((1, -1), repeat=3))
+    return [Piece(kind, spline.shapes[kind], turn) for kind, turn in spline.tetrahedra]
 
 
 def patch(piece: Piece, coefficients: np.ndarray, level: float, fineness: int) -> np.ndarray:

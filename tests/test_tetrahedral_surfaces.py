@@ -11,7 +11,7 @@ from torch import Tensor
 
 import filterlab as fl
 from filterlab import bernstein
-from filterlab.fields.tetrahedral_pieces import Planes, tetrahedra
+from filterlab.fields.tetrahedral_pieces import Planes
 from filterlab.methods import METHODS, Tetrahedral
 from filterlab.render import PerspectiveCamera, raycast
 from filterlab.surfaces import LevelSet
@@ -48,7 +48,7 @@ def rays(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 def test_planes_and_tetrahedra_of_the_partitions():
-    assert [len(tetrahedra(METHODS[name].spline)) for name in SPLINES] == [24, 24, 144]
+    assert [len(METHODS[name].spline.tetrahedra) for name in SPLINES] == [24, 24, 144]
     type6 = Planes.of(METHODS["cubic-c1"].spline)
     assert type6.outer == (((0, 0, 1), 0.5), ((0, 1, 0), 0.5), ((1, 0, 0), 0.5))
     assert set(type6.inner) == {(0, 1, 1), (0, 1, -1), (1, 0, 1), (1, 0, -1), (1, 1, 0), (1, -1, 0)}
@@ -189,7 +189,7 @@ def test_relevant_cells_and_tetrahedra(name):
     assert none == (0, 0)
     spline = METHODS[name].spline
     assert 0 < few.cells < 1000 / (4 if spline.period == 2 else 1) / 2
-    assert few.cells < few.pieces < len(tetrahedra(spline)) * few.cells
+    assert few.cells < few.pieces < len(spline.tetrahedra) * few.cells
 
 
 @every_spline

@@ -23,7 +23,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from itertools import product
+from itertools import permutations, product
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -50,6 +51,30 @@ def weighted(*parts: tuple[Fraction, Mask]) -> Mask:
         for sample, weight in mask.items():
             total[sample] = total.get(sample, Fraction(0)) + factor * weight
     return {sample: weight for sample, weight in total.items() if weight}
+
+
+Coordinate = TypeVar("Coordinate", int, Fraction)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A signed permutation of the axes: what it makes of v has sign_a · v_rank(a) along axis a of space.
+
+    Attributes:
+        ranks: axis a of space is this one of the cone.
+        signs: along the axes of space.
+    """
+
+    ranks: tuple[int, ...]
+    signs: tuple[int, ...]
+
+    def __call__(self, v: tuple[Coordinate, Coordinate, Coordinate]) -> tuple[Coordinate, Coordinate, Coordinate]:
+        x, y, z = (sign * v[rank] for rank, sign in zip(self.ranks, self.signs, strict=True))
+        return x, y, z
+
+
+TURNS = tuple(Turn(ranks, signs) for ranks in permutations(range(3)) for signs in product((1, -1), repeat=3))
+"""All 48."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +152,15 @@ class Spline:
     def norm(self) -> Fraction:
         """max_α Σ_o |mask_α(o)|: no value is larger than this times the largest sample."""
         return max(sum(map(abs, mask.values()), Fraction(0)) for s in self.shapes for mask in s.masks.values())
+
+    @cached_property
+    def tetrahedra(self) -> tuple[tuple[int, Turn], ...]:
+        """All of a cell, each once: the number of the shape that is turned, and how."""
+        found: dict[frozenset[Vector], tuple[int, Turn]] = {}
+        for number, shape in enumerate(self.shapes):
+            for turn in TURNS:
+                found.setdefault(frozenset(map(turn, shape.vertices)), (number, turn))
+        return tuple(found.values())
 
     @cached_property
     def tables(self) -> Tables:

@@ -13,12 +13,10 @@ Source: Kalbe and Zeilfelder 2008, section 5, and the walk through planes instea
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
-from itertools import permutations, product
-from typing import TypeVar
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -26,14 +24,13 @@ from torch import Tensor
 from filterlab import bernstein
 from filterlab.fields.base import Field, Relevant, type_of_rays
 from filterlab.fields.grid import GridField
-from filterlab.fields.tetrahedral import JetOnTetrahedra, Located, OnTetrahedra, Spline, locate
+from filterlab.fields.tetrahedral import TURNS, JetOnTetrahedra, Located, OnTetrahedra, Spline, Turn, locate
 from filterlab.ops.pieces import Pieces
-from filterlab.ops.reference.pieces import CHUNK, Lines, inside
+from filterlab.ops.reference.pieces import CHUNK, Lines, inside, joined
 
 _ROUNDING = 64  # units of rounding, relative to the largest value, by which bounds of a cell are widened
 
 Normal = tuple[int, int, int]
-T = TypeVar("T", int, Fraction)
 Bounds = tuple[Tensor, Tensor, int]
 """The least and the greatest sample that each cell needs, (D, H, W) float64, and the first cell along every axis."""
 
@@ -51,14 +48,15 @@ class Planes:
     inner: tuple[Normal, ...]
 
     @classmethod
+    @cache
     def of(cls, spline: Spline) -> Planes:
         outer, inner = set(), set()
         for shape in spline.shapes:
             (apex, *sides) = (_primitive(row) for row in shape.barycentric)
-            for turn in _turns():
-                normal, d = _upright(_turned(apex[0], *turn), -apex[1])
+            for turn in TURNS:
+                normal, d = _upright(turn(apex[0]), -apex[1])
                 outer.add((normal, float((sum(normal) * spline.shift + d) % 1)))
-                inner.update(_upright(_turned(normal, *turn), Fraction(0))[0] for normal, _ in sides)
+                inner.update(_upright(turn(normal), Fraction(0))[0] for normal, _ in sides)
         return cls(tuple(sorted(outer)), tuple(sorted(inner)))
 
 
@@ -74,27 +72,6 @@ def _upright(normal: Normal, d: Fraction) -> tuple[Normal, Fraction]:
     """The same plane n · x = d, of both normals the greater."""
     x, y, z = normal
     return max((normal, d), ((-x, -y, -z), -d), key=lambda plane: plane[0])
-
-
-def _turns() -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """The 48 signed permutations: axes of space by axes of the cone, and signs along the axes of space."""
-    return product(permutations(range(3)), product((1, -1), repeat=3))
-
-
-def _turned(vector: tuple[T, T, T], axes: tuple[int, ...], signs: tuple[int, ...]) -> tuple[T, T, T]:
-    out = [vector[0]] * 3
-    for own, axis in zip(vector, axes, strict=True):
-        out[axis] = own * signs[axis]
-    return out[0], out[1], out[2]
-
-
-def tetrahedra(spline: Spline) -> list[tuple[int, tuple[int, ...], tuple[int, ...]]]:
-    """All tetrahedra of a cell, each once: (shape, axes, signs)."""
-    found = {}
-    for number, shape in enumerate(spline.shapes):
-        for axes, signs in _turns():
-            found.setdefault(frozenset(_turned(v, axes, signs) for v in shape.vertices), (number, axes, signs))
-    return list(found.values())
 
 
 class FieldOnTetrahedra(GridField):
@@ -116,12 +93,7 @@ class FieldOnTetrahedra(GridField):
     crossing_candidates = Field.crossing_candidates
 
     def _most_pieces(self) -> int:
-        planes = self._planes
-        return super()._most_pieces() * (len(planes.inner) + 1)
-
-    @cached_property
-    def _planes(self) -> Planes:
-        return Planes.of(self.scheme.spline)
+        return super()._most_pieces() * (len(Planes.of(self.scheme.spline).inner) + 1)
 
     def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
         self._check_pieces()
@@ -137,14 +109,14 @@ class FieldOnTetrahedra(GridField):
             line, near, far, cells = (x[keep] for x in (line, near, far, cells))
         line, near, far = _cut(line, near, far, self._inner(lines, line, cells))
         coefficients = self._restricted(lines, line, near, far, dtype)
-        return Pieces(ray[line], near, far, _joined(coefficients, line, near, far), start)
+        return Pieces(ray[line], near, far, joined(coefficients, line, near, far), start)
 
     # --- where a ray passes from one polynomial into another ---
 
     def _outer(self, lines: Lines) -> Tensor:
         """Where lines (L) pass planes that bound cells, (L, K); beyond their ends where there are fewer."""
         found = []
-        for normal, offset in self._planes.outer:
+        for normal, offset in Planes.of(self.scheme.spline).outer:
             n = lines.origins.new_tensor(normal)
             place, speed = lines.origins @ n - offset, lines.directions @ n
             ends = place + speed * lines.near, place + speed * lines.far
@@ -157,7 +129,7 @@ class FieldOnTetrahedra(GridField):
 
     def _inner(self, lines: Lines, line: Tensor, cells: Tensor) -> Tensor:
         """Where they pass planes through the centres of cells (P, 3), (P, M)."""
-        normals = lines.origins.new_tensor(self._planes.inner).T
+        normals = lines.origins.new_tensor(Planes.of(self.scheme.spline).inner).T
         place = (lines.origins[line] - (cells + float(self.scheme.spline.shift))) @ normals
         speed = (lines.directions @ normals)[line]
         return torch.where(speed == 0, torch.inf, -place / torch.where(speed == 0, 1, speed))
@@ -252,7 +224,7 @@ class FieldOnTetrahedra(GridField):
         cells = cells[self._may_hold(cells, level, torch.float64)]
         total, held = 0, torch.zeros(len(cells), dtype=torch.bool, device=device)
         for part in torch.arange(len(cells), device=device).split(CHUNK):
-            for which in tetrahedra(spline):
+            for which in spline.tetrahedra:
                 low, high = bernstein.bounds(self._bernstein(_placed(cells[part], *which), torch.float64))
                 holds = (low <= level) & (level <= high)
                 held[part] |= holds
@@ -260,21 +232,19 @@ class FieldOnTetrahedra(GridField):
         return Relevant(int(held.sum()), total)
 
 
-def _placed(cells: Tensor, shape: int, axes: tuple[int, ...], signs: tuple[int, ...]) -> Located:
+def _placed(cells: Tensor, shape: int, turn: Turn) -> Located:
     """One tetrahedron of every cell (P, 3); without barycentric coordinates."""
     count = len(cells)
 
-    def everywhere(row: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    def everywhere(row: Sequence[int], dtype: torch.dtype) -> Tensor:
         return torch.tensor(row, dtype=dtype, device=cells.device)[:, None].expand(3, count)
 
-    ranks = tuple(axes.index(axis) for axis in range(3))
-    number = torch.full((count,), shape, device=cells.device)
     return Located(
         cells.long().T,
-        everywhere(axes, torch.int64),
-        everywhere(ranks, torch.int64),
-        everywhere(signs, torch.float64),
-        number,
+        everywhere([turn.ranks.index(axis) for axis in range(3)], torch.int64),
+        everywhere(turn.ranks, torch.int64),
+        everywhere(turn.signs, torch.float64),
+        torch.full((count,), shape, device=cells.device),
         cells.new_empty(0),
     )
 
@@ -287,14 +257,6 @@ def _cut(line: Tensor, near: Tensor, far: Tensor, events: Tensor) -> tuple[Tenso
     some = b > a
     some[:, 0] |= far == near  # of a line that touches the domain
     return line[:, None].expand_as(a)[some], a[some], b[some]
-
-
-def _joined(coefficients: Tensor, line: Tensor, near: Tensor, far: Tensor) -> Tensor:
-    """Neighbours both have the value at their end that the first has."""
-    last = coefficients[:-1, -1]
-    same = (line[1:] == line[:-1]) & (near[1:] == far[:-1]) & last.isfinite()
-    coefficients[1:, 0] = torch.where(same, last, coefficients[1:, 0])
-    return coefficients
 
 
 def _pooled(values: Tensor, window: int) -> Tensor:

@@ -22,9 +22,9 @@ _LAYERS = 32  # of cells at a time, where they are joined to parts
 
 def bounds(lattice: Lattice, edge: int, codes: Codes) -> Bounds:
     """`ops.reference.bounds.bounds`, fused."""
-    depth = lattice.cells[2]
+    coefficients, depth = in_whole_rows(lattice.coefficients), lattice.cells[2]
     step = depth if edge == 1 else _LAYERS
-    parts = [_of_layers(lattice, codes, z, min(step, depth - z)) for z in range(0, depth, step)]
+    parts = [_of_layers(lattice, coefficients[z:], codes, min(step, depth - z)) for z in range(0, depth, step)]
     lows, highs, ends = zip(*parts, strict=True)
     low, high = (
         torch.from_numpy(np.concatenate([_joined(x, edge, least) for x in own]))
@@ -34,10 +34,9 @@ def bounds(lattice: Lattice, edge: int, codes: Codes) -> Bounds:
 
 
 def _of_layers(
-    lattice: Lattice, codes: Codes, first: int, depth: int
+    lattice: Lattice, coefficients: Tensor, codes: Codes, depth: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Of single cells."""
-    coefficients = in_whole_rows(lattice.coefficients)[first:]
+    """Of single cells, whose first taps are the first of the coefficients."""
     plane, row, _ = coefficients.stride()
     width, height, _ = lattice.cells
     lanes = lanes_of(torch.float64)

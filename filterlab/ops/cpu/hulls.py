@@ -10,11 +10,12 @@ import ctypes
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from math import comb
 from types import SimpleNamespace
 
+import torch
 from llvmlite import ir
 
+from filterlab import bernstein
 from filterlab.ops.bounds import CODES
 from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.lanes import DOUBLE, I16, I32, I64, STORAGE, Lanes, Value
@@ -183,6 +184,6 @@ class _Program:
 
 
 def _bernstein(monomial: Sequence[float], degree: int) -> list[float]:
-    """b_i = Σ_k a_k binom(i, k) / binom(n, k)."""
-    n = degree
-    return [sum(a * comb(i, k) / comb(n, k) for k, a in enumerate(monomial) if k <= i) for i in range(n + 1)]
+    """Of a polynomial that may have a lower degree."""
+    whole = [*monomial, *[0.0] * (degree + 1 - len(monomial))]
+    return bernstein.from_monomial(torch.tensor(whole, dtype=torch.float64)).tolist()

@@ -152,7 +152,7 @@ def pieces(lines: Lines, passed: Passed, lattice: Lattice, dtype: torch.dtype) -
         for part in torch.arange(len(passed.line), device=values.device).split(CHUNK)
     ]
     out = torch.cat(parts) if parts else values.new_zeros((0, lattice.degree + 1), dtype=dtype)
-    return _joined(out, passed) if lattice.continuous else out
+    return joined(out, passed.line, passed.near, passed.far) if lattice.continuous else out
 
 
 def _places(lines: Lines, passed: Passed, part: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -163,9 +163,10 @@ def _places(lines: Lines, passed: Passed, part: Tensor, dtype: torch.dtype) -> t
     return near.to(dtype), far.to(dtype)
 
 
-def _joined(coefficients: Tensor, passed: Passed) -> Tensor:
+def joined(coefficients: Tensor, line: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    """Coefficients (P, n + 1), written to: of two pieces that are neighbours both have the value that the first has."""
     last = coefficients[:-1, -1]
-    same = (passed.line[1:] == passed.line[:-1]) & (passed.near[1:] == passed.far[:-1]) & last.isfinite()
+    same = (line[1:] == line[:-1]) & (near[1:] == far[:-1]) & last.isfinite()
     coefficients[1:, 0] = torch.where(same, last, coefficients[1:, 0])
     return coefficients
 
