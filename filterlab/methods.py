@@ -232,11 +232,7 @@ class TensorProduct(Method):
     def build(self, volume: Volume, asked: Asked) -> Field:
         scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
         coefficients = asked.coefficients(self.prefilter, scheme.reach, _storage_for(self, asked.storage), self.factor)
-        if isinstance(scheme, Direct) and scheme.name == "fused" and (why := _missing_for_fused(coefficients, scheme)):
-            if asked.scheme is not None:
-                raise ValueError(f"scheme='fused' can't run here: {why}; scheme='direct' can")
-            scheme = replace(scheme, name="direct")
-        return GridField(self.name, volume, coefficients, scheme)
+        return GridField(self.name, volume, coefficients, _that_runs(scheme, coefficients, asked))
 
 
 @dataclass(frozen=True)
@@ -256,7 +252,7 @@ class Tetrahedral(Method):
     continuity: int
     prefilter: Prefilter = prefilters.QUADRATIC
     gradients: tuple[str, ...] = ("analytic",)
-    schemes: tuple[str, ...] = ("direct",)
+    schemes: tuple[str, ...] = ("fused", "direct")
 
     @cached_property
     def facts(self) -> Facts:
@@ -277,7 +273,7 @@ class Tetrahedral(Method):
         self._check_offered(name, gradient)
         if sampler != "exact":
             raise ValueError(f"sampler={sampler!r} needs scheme='sampled'; {self.name} takes no samples between voxels")
-        return OnTetrahedra(self.spline)
+        return OnTetrahedra(self.spline, name or self.schemes[0])
 
     def reach(self, prefilter: bool) -> int:
         return self.spline.support + (self.prefilter.decay(torch.float64) if prefilter else 0)
@@ -285,7 +281,7 @@ class Tetrahedral(Method):
     def build(self, volume: Volume, asked: Asked) -> Field:
         scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
         coefficients = asked.coefficients(self.prefilter, scheme.reach, named_storage(asked.storage))
-        return FieldOnTetrahedra(self.name, volume, coefficients, scheme)
+        return FieldOnTetrahedra(self.name, volume, coefficients, _that_runs(scheme, coefficients, asked))
 
 
 _FORMER_SCHEMES = {"eight_trilinear": "sampled"}
@@ -463,7 +459,18 @@ def _storage_for(method: TensorProduct, storage: str | torch.dtype | None) -> to
     return dtype
 
 
-def _missing_for_fused(coefficients: Coefficients, scheme: Direct) -> str | None:
+def _that_runs(scheme: Scheme, coefficients: Coefficients, asked: Asked) -> Scheme:
+    """The scheme, or in plain torch where a fused one was not asked for and can't run."""
+    if not isinstance(scheme, Direct | OnTetrahedra) or scheme.name != "fused":
+        return scheme
+    if (why := _missing_for_fused(coefficients, scheme)) is None:
+        return scheme
+    if asked.scheme is not None:
+        raise ValueError(f"scheme='fused' can't run here: {why}; scheme='direct' can")
+    return replace(scheme, name="direct")
+
+
+def _missing_for_fused(coefficients: Coefficients, scheme: Direct | OnTetrahedra) -> str | None:
     """What the fused sum lacks for these coefficients, or None."""
     values = coefficients.values.detach().reshape(-1, 1, *coefficients.values.shape[-3:])
     points = torch.empty(values.shape[0], 0, 3, device=values.device)

@@ -83,8 +83,8 @@ def _around(c: tuple[int, int, int], s: tuple[int, ...]) -> Vector:
 def _octahedra(x: Tensor) -> Tensor:
     """(i, j, k) of the octahedron around each point, all even or all odd: |x − centre|₁ ≤ 3/2, no coordinate over 1."""
     y = x - 0.5
-    even, odd = 2 * torch.round(y / 2), 2 * torch.round((y - 1) / 2) + 1
+    even, odd = 2 * (y / 2 + 0.5).floor(), 2 * (y / 2).floor() + 1
     return torch.where((y - even).abs().sum(-1, keepdim=True) <= 1.5, even, odd)
 
 
-QUADRATIC_C1 = Spline("quadratic-c1", 2, tuple(map(_shape, _KINDS)), _octahedra, Fraction(1, 2), 2)
+QUADRATIC_C1 = Spline("quadratic-c1", 2, tuple(map(_shape, _KINDS)), _octahedra, Fraction(1, 2), 2, _CENTRES, 2)

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import permutations, product
@@ -30,13 +30,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab import bernstein
+from filterlab import bernstein, ops
 from filterlab.bernstein import Index, multi_indices
-from filterlab.fields.grid import Coefficients, Evaluation, Term
-from filterlab.ops.differentiable.recording import plain
+from filterlab.fields.grid import Coefficients, Evaluation, Term, implementation_of
+from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.place import Placement
 from filterlab.ops.reference.place import far_voxels
-from filterlab.volume import Geometry, all_between
+from filterlab.ops.tetrahedra import Tetrahedra, TetrahedralStencil
+from filterlab.volume import Boundary, Geometry, all_between
 
 Vector = tuple[Fraction, Fraction, Fraction]
 
@@ -119,6 +120,7 @@ class Spline:
         cells: voxel coordinates (..., 3) -> the cell of each, (..., 3) whole numbers of the same type.
         shift: the centre of a cell lies at cell + shift along every axis: 0 or ½.
         period: how far the partition has to be moved along an axis to lie on itself: 1 or 2.
+        centres, size: of the cubes of size³ samples that all tetrahedra of the cone need, relative to the centre.
 
     Raises ValueError where a shape has not a mask for every coefficient, or not the samples of the others.
     """
@@ -129,6 +131,8 @@ class Spline:
     cells: Callable[[Tensor], Tensor]
     shift: Fraction
     period: int
+    centres: tuple[tuple[int, int, int], ...]
+    size: int
 
     def __post_init__(self) -> None:
         for shape in self.shapes:
@@ -166,6 +170,32 @@ class Spline:
     def tables(self) -> Tables:
         """All of it in numbers, on the CPU."""
         return Tables.of(self)
+
+    @cached_property
+    def lowered(self) -> Tetrahedra:
+        """All of it as `ops` sums it."""
+        indices = multi_indices(self.degree, 3)
+        masks: dict[tuple[float, ...], int] = {}
+        rows = [tuple(masks.setdefault(s.row(a, self.samples), len(masks)) for a in indices) for s in self.shapes]
+        return Tetrahedra(
+            octahedral=self.period == 2,
+            degree=self.degree,
+            centres=tuple((int(x), int(y), int(z)) for x, y, z in self.centres),
+            size=self.size,
+            samples=tuple(map(self._place_in_blocks, self.samples)),
+            masks=tuple(masks),
+            rows=tuple(rows),
+            barycentric=tuple(tuple(tuple(map(float, row)) for row in s.barycentric) for s in self.shapes),
+        )
+
+    def _place_in_blocks(self, sample: Vector) -> tuple[int, tuple[int, int, int]]:
+        """The block that a sample is in, the first one, and its place there."""
+        half = Fraction(self.size - 1, 2)
+        for number, centre in enumerate(self.centres):
+            x, y, z = (o - c + half for o, c in zip(sample, centre, strict=True))
+            if all(0 <= place <= 2 * half for place in (x, y, z)):
+                return number, (int(x), int(y), int(z))
+        raise ValueError(f"{self.name}: no block of samples has the one at {tuple(map(str, sample))}")
 
 
 # --- the spline in numbers --------------------------------------------------------------------------------------------
@@ -386,6 +416,9 @@ class Folding:
 
 # --- the scheme -------------------------------------------------------------------------------------------------------
 
+_BEYOND = 1
+"""Voxels outside of the samples at both ends of an axis up to which programs evaluate: the domain goes to ½."""
+
 AT_ONCE = 1 << 13
 """Points whose samples are read together: (K, P) numbers stay in cache."""
 AT_ONCE_ON_A_GPU = 1 << 20
@@ -393,7 +426,10 @@ AT_ONCE_ON_A_GPU = 1 << 20
 
 @dataclass(frozen=True)
 class OnTetrahedra:
-    """The sum over Bernstein coefficients, made of the samples for every point; in plain torch.
+    """The sum over Bernstein coefficients, made of the samples for every point.
+
+    `direct` computes it in plain torch, wherever points are; `fused` in vector code made for this processor, of points
+    in the domain and a little beyond: others, and transforms of torch.func and torch.compile, it leaves to the former.
 
     Attributes:
         spline: what is summed.
@@ -405,14 +441,57 @@ class OnTetrahedra:
     name: str = "direct"
     gradient: str = "analytic"
     max_order: int = 2
-    reach: int = 1
     terms: tuple[Term, ...] = ()
     exact: bool = False
 
+    @property
+    def reach(self) -> int:
+        return _BEYOND + max(self.spline.lowered.reach) if self.name == "fused" else 1
+
+    @cached_property
+    def stencils(self) -> tuple[TetrahedralStencil, ...]:
+        """What is summed for a jet of order 0, 1, … `max_order`."""
+        return tuple(
+            TetrahedralStencil(self.spline.lowered, tuple(range(order + 1))) for order in range(self.max_order + 1)
+        )
+
     def evaluation(self, coefficients: Coefficients, placement: Placement, order: int) -> Evaluation:
+        everywhere = self.everywhere(coefficients, placement, order)
+        if self.name == "direct":
+            return everywhere
+        values, around = coefficients.values, replace(placement, boundary=Boundary.BORDER, tail=_BEYOND)
+        implementation = implementation_of(self.name, values.device)
+        near = ops.Evaluation(values, around, self.stencils[order], coefficients.start, implementation)
+        return FusedOnTetrahedra(near, everywhere)
+
+    def everywhere(self, coefficients: Coefficients, placement: Placement, order: int) -> JetOnTetrahedra:
+        """The jet in plain torch."""
         tables = self.spline.tables.to(coefficients.values.device)
         folding = Folding.of(coefficients, self.spline)
         return JetOnTetrahedra(self.spline, tables, folding, coefficients.values, placement, order)
+
+
+@dataclass(frozen=True, eq=False)
+class FusedOnTetrahedra:
+    """A jet by programs where they know the samples, else in plain torch; see `Evaluation`.
+
+    Attributes:
+        near: of points up to `_BEYOND` voxels outside of the samples, which it does not fold; tells others by a sign 0.
+        everywhere: of all points.
+    """
+
+    near: ops.Evaluation
+    everywhere: JetOnTetrahedra
+
+    def __call__(self, points: Tensor) -> tuple[Tensor, None]:
+        if transformed():
+            return self.everywhere(points)
+        rows, sign = self.near(points)
+        if sign is not None:
+            (beyond,) = (sign == 0).any(-1).any(0).nonzero(as_tuple=True)
+            if len(beyond):
+                rows = rows.index_copy(-1, beyond, self.everywhere(points.index_select(1, beyond))[0])
+        return rows, None
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
 
@@ -79,10 +79,14 @@ class FieldOnTetrahedra(GridField):
 
     scheme: OnTetrahedra
     _kept: tuple[int, Bounds] | None
+    _jet: JetOnTetrahedra
 
     def _settle(self) -> None:
         super()._settle()
         self._kept = None  # a copy has other coefficients
+        values = self.coefficients.values
+        own = replace(self.coefficients, values=values if self.channels is not None else values[None, None])
+        self._jet = self.scheme.everywhere(own, self.placement, 0)
 
     @property
     def degree_along_rays(self) -> int | None:
@@ -139,10 +143,6 @@ class FieldOnTetrahedra(GridField):
         return self.scheme.spline.cells(lines.chosen(line).at((near + far) / 2))
 
     # --- polynomials ---
-
-    @property
-    def _jet(self) -> JetOnTetrahedra:
-        return self._own[0]  # type: ignore[return-value]
 
     def _restricted(self, lines: Lines, line: Tensor, near: Tensor, far: Tensor, dtype: torch.dtype) -> Tensor:
         """(P, n + 1) Bernstein coefficients along pieces, each within one tetrahedron."""

@@ -247,11 +247,11 @@ def _name(alpha: tuple[int, ...]) -> str:
 
 
 def _cubes(voxels: Tensor) -> Tensor:
-    return voxels.round()
+    return (voxels + 0.5).floor()
 
 
-QSS = Spline("qss", 2, (_shape(2, _quadratic),), _cubes, Fraction(0), 1)
+QSS = Spline("qss", 2, (_shape(2, _quadratic),), _cubes, Fraction(0), 1, ((0, 0, 0),), 3)
 """Quadratic super splines: C¹ across the faces of cubes, C⁰ within."""
 
-CUBIC_C1 = Spline("cubic-c1", 3, (_shape(3, _cubic),), _cubes, Fraction(0), 1)
+CUBIC_C1 = Spline("cubic-c1", 3, (_shape(3, _cubic),), _cubes, Fraction(0), 1, ((0, 0, 0),), 3)
 """Cubic splines, C¹ everywhere."""

@@ -25,6 +25,7 @@ from filterlab.ops.differentiable.gather import IMPLEMENTATIONS
 from filterlab.ops.differentiable.prefilter import prefilter_axis, prefilter_samples
 from filterlab.ops.place import Placed, Placement
 from filterlab.ops.stencil import Product, Stencil, multi_indices
+from filterlab.ops.tetrahedra import AnyStencil, TetrahedralStencil
 
 __all__ = [
     "IMPLEMENTATIONS",
@@ -32,6 +33,7 @@ __all__ = [
     "Placement",
     "Product",
     "Stencil",
+    "TetrahedralStencil",
     "gather",
     "jet",
     "multi_indices",
@@ -43,7 +45,7 @@ __all__ = [
 ]
 
 
-def _check(batch: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int]) -> None:
+def _check(batch: Tensor, points: Tensor, stencil: AnyStencil, shape: Sequence[int]) -> None:
     if points.ndim != 3 or points.shape[-1] != 3 or not points.is_floating_point():
         raise ValueError(f"points must be floating point of shape (N, M, 3); got {points.dtype} {tuple(points.shape)}")
     if points.shape[0] != batch.shape[0]:
@@ -53,7 +55,7 @@ def _check(batch: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int]
             raise ValueError(f"axis {axis} has {n} coefficients; the stencil needs {support}")
 
 
-def _check_implementation(name: str, values: Tensor, points: Tensor, stencil: Stencil, *sizes) -> None:
+def _check_implementation(name: str, values: Tensor, points: Tensor, stencil: AnyStencil, *sizes) -> None:
     if name not in IMPLEMENTATIONS:
         raise ValueError(f"implementation must be one of {', '.join(IMPLEMENTATIONS)}; got {name!r}")
     if why := sums.missing(name, values, points, stencil, *sizes):
@@ -61,7 +63,7 @@ def _check_implementation(name: str, values: Tensor, points: Tensor, stencil: St
 
 
 def gather(
-    coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0, implementation: str = "reference"
+    coefficients: Tensor, points: Tensor, stencil: AnyStencil, start: int = 0, implementation: str = "reference"
 ) -> Tensor:
     """The rows of a stencil at the points: row = Σ_i weight_i Σ_k c_k φ_x^(m_x)(x−k_x) φ_y^(m_y) φ_z^(m_z).
 
@@ -95,7 +97,7 @@ def gather(
 def scatter(
     cotangents: Tensor,
     points: Tensor,
-    stencil: Stencil,
+    stencil: AnyStencil,
     shape: Sequence[int],
     start: int = 0,
     implementation: str = "reference",

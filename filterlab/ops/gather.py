@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 
 MAX_ORDER = 3
 MAX_SUPPORT = 6
@@ -33,7 +34,7 @@ STORAGE = {
 
 
 def unsupported(
-    coefficients: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int] | None = None
+    coefficients: Tensor, points: Tensor, stencil: AnyStencil, shape: Sequence[int] | None = None
 ) -> str | None:
     """What no fused implementation can do of a gather (or, with `shape`, a scatter of cotangents); None: nothing."""
     if points.dtype not in (torch.float32, torch.float64):
@@ -42,7 +43,7 @@ def unsupported(
         return f"coefficients must be stored as {', '.join(STORAGE.values())}; got {coefficients.dtype}"
     if not stencil.exact:
         return "its kernels are fixed tables; got a TensorKernel"
-    if max(stencil.supports) > MAX_SUPPORT:
+    if isinstance(stencil, Stencil) and max(stencil.supports) > MAX_SUPPORT:
         return f"supports go up to {MAX_SUPPORT}; got {', '.join(str(s) for s in stencil.supports)}"
     if stencil.order > MAX_ORDER:
         return f"orders go up to {MAX_ORDER}; got {stencil.order}"

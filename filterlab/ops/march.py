@@ -15,7 +15,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 
 MAX_LIGHTS = 8
 
@@ -146,7 +146,7 @@ class March:
 
     coefficients: Tensor
     start: int
-    stencil: Stencil
+    stencil: AnyStencil
     chords: Chords
     transfer: Transfer
     lighting: Lighting | None

@@ -93,6 +93,10 @@ class Stencil:
         """The largest m_x + m_y + m_z."""
         return max(sum(product.orders) for row in self.rows for product in row)
 
+    def up_to(self, order: int) -> Stencil:
+        """Of a value and its derivatives those of orders up to this one."""
+        return Stencil(self.rows[: len(multi_indices(order))])
+
     @cached_property
     def derivatives(self) -> tuple[Stencil, tuple[tuple[int, ...], ...]]:
         """(stencil, raised): row raised[axis][r] of that stencil is the derivative along `axis` of row r of this one.

@@ -27,7 +27,8 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from filterlab.ops.march import Bricks
 from filterlab.ops.reference.bounds import over_windows
-from filterlab.ops.stencil import Lowered, Stencil, Table
+from filterlab.ops.stencil import Lowered, Table
+from filterlab.ops.tetrahedra import AnyStencil, LoweredStencil, TetrahedralStencil
 from filterlab.render.transfer import TransferFunction
 
 _EDGES = (2, 3)  # log₂ B: bricks of 4³ cells, and of 8³ where there would be more of those than
@@ -41,7 +42,7 @@ _LARGEST = 1 << 24  # numbers that bounding such a sum may take
 
 
 def bricks_of(
-    coefficients: Tensor, stencil: Stencil, transfer: TransferFunction, edge: int | None = None
+    coefficients: Tensor, stencil: AnyStencil, transfer: TransferFunction, edge: int | None = None
 ) -> Bricks | None:
     """Where a volume is empty; None: nowhere.
 
@@ -119,7 +120,7 @@ def _ranges(grid: Tensor, supports: tuple[int, int, int], edge: int) -> tuple[Te
 # --- values and opacities -------------------------------------------------------------------------------------------
 
 
-def values(low: Tensor, high: Tensor, stencil: Lowered, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+def values(low: Tensor, high: Tensor, stencil: LoweredStencil, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Between what the first row of a stencil lies, of coefficients between `low` and `high`, computed in a dtype."""
     least, most, norm = bound(stencil)
     middle, half = (low + high) / 2, (high - low) / 2
@@ -157,11 +158,13 @@ def distances(empty: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=256)
-def bound(stencil: Lowered) -> tuple[float, float, float]:
+def bound(stencil: LoweredStencil) -> tuple[float, float, float]:
     """(least Σ w, most Σ w, most Σ |w|) of the first row, over all places in a cell.
 
     On part of a cell a polynomial lies between its smallest and largest Bernstein coefficient there.
     """
+    if isinstance(stencil, TetrahedralStencil):
+        return 1.0, 1.0, stencil.spline.norm
     row = stencil.rows[0]
     axes = [[_Weights(table) for table in functions] for functions in stencil.functions]
     least = most = norm = 0.0

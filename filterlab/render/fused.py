@@ -15,14 +15,18 @@ from torch import Tensor
 
 from filterlab.fields.grid import GridField
 from filterlab.fields.tensor_product import Direct
+from filterlab.fields.tetrahedral import OnTetrahedra
 from filterlab.ops.differentiable import march
 from filterlab.ops.march import Bricks, Chords, Lighting, March, Transfer
 from filterlab.ops.reference.optics import safe_normalize
-from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 from filterlab.render.bricks import bricks_of
 from filterlab.render.plain import Medium, Report
 from filterlab.render.shading import Light, Shading
 from filterlab.render.transfer import TransferFunction
+
+_SUMS = (Direct, OnTetrahedra)
+"""Schemes that sum a stencil."""
 
 SKIPPING = True
 """Whether empty space is left out; it changes no bit of the image."""
@@ -36,7 +40,7 @@ def why_not_fused(medium: Medium) -> str | None:
     are the plain marcher's.
     """
     field = medium.field
-    if not isinstance(field, GridField) or not isinstance(field.scheme, Direct) or field.scheme.name != "fused":
+    if not isinstance(field, GridField) or not isinstance(field.scheme, _SUMS) or field.scheme.name != "fused":
         scheme = f"scheme {field.scheme.name!r}" if isinstance(field, GridField) else f"a {type(field).__name__}"
         return f"it marches fields of scheme 'fused'; this is {scheme}"
     values, start = field.coefficients.values, field.coefficients.start
@@ -51,9 +55,9 @@ def why_not_fused(medium: Medium) -> str | None:
     return march.missing(values[(0,) * (values.ndim - 3)], _stencil(medium), start, medium.dtype, lights)
 
 
-def _stencil(medium: Medium) -> Stencil:
+def _stencil(medium: Medium) -> AnyStencil:
     scheme = _grid(medium).scheme
-    assert isinstance(scheme, Direct)
+    assert isinstance(scheme, _SUMS)
     return scheme.stencils[medium.order]
 
 

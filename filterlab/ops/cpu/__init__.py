@@ -20,7 +20,7 @@ from torch import Tensor
 
 from filterlab import forking
 from filterlab.ops.gather import unsupported
-from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 
 _COORDINATES = {torch.float32: 1 << 24, torch.float64: 1 << 28}  # exact in the dtype; 8 times it fits 32 bits
 
@@ -28,7 +28,7 @@ _COORDINATES = {torch.float32: 1 << 24, torch.float64: 1 << 28}  # exact in the 
 def missing(
     coefficients: Tensor,
     points: Tensor,
-    stencil: Stencil,
+    stencil: AnyStencil,
     shape: Sequence[int] | None = None,
     start: int = 0,
 ) -> str | None:

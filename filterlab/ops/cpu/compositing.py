@@ -33,11 +33,12 @@ from filterlab.ops.cpu import frame, job, mathematics
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import DOUBLE, I64, POINTER, STORAGE, Lanes, Value
 from filterlab.ops.cpu.optics import Lights, OnTable, Steps, TransferTable, optical_depth, shade
+from filterlab.ops.cpu.sums import Sums, sums_of
 from filterlab.ops.cpu.tape import Node, Tape
-from filterlab.ops.cpu.taps import Grid, Location, Taps
+from filterlab.ops.cpu.taps import Grid
 from filterlab.ops.cpu.traversal import Ray, Run, Segments, State, Traversal
 from filterlab.ops.march_derivatives import TABLE_ROW, gradient_columns
-from filterlab.ops.stencil import Lowered
+from filterlab.ops.tetrahedra import LoweredStencil
 
 TABLES = 2  # of derivatives by the transfer function, to be summed
 
@@ -114,8 +115,8 @@ class MarchVariant:
     """
 
     gradients: tuple[str, ...]
-    stencil: Lowered
-    derivatives: tuple[Lowered, tuple[tuple[int, ...], ...]] | None
+    stencil: LoweredStencil
+    derivatives: tuple[LoweredStencil, tuple[tuple[int, ...], ...]] | None
     lit: bool
     lights: int
     skipping: bool
@@ -140,9 +141,9 @@ class _Parts:
     parts: programs that are much longer are slow to read for a processor.
     """
 
-    def __init__(self, lanes: Lanes, taps: Taps) -> None:
+    def __init__(self, lanes: Lanes, taps: Sums) -> None:
         self.lanes, self.builder, self.taps = lanes, lanes.builder, taps
-        self.location = Location(lanes, taps.supports, taps.storage, taps.grid)
+        self.location = taps.location(lanes)
 
     def contract(self, points: Sequence[Value], volume: Value) -> list[Value]:
         """The rows of the stencil."""
@@ -203,15 +204,14 @@ class _Program:
         self.table, self.table_of_run = (
             TransferTable(lanes, self.variant.interval, j.inner, *tables, steps) for lanes in (e, self.run)
         )
-        location = Location(self.run, taps.supports, self.storage, self.grid)
-        self.traversal = Traversal(location, j, self.kept, self.variant.skipping)
+        self.traversal = Traversal(taps.location(self.run), j, self.kept, self.variant.skipping)
         self.prepare()
         with frame.every_chunk(e, j) as chunk, self.traversal.every_block(chunk):
             self._march_block()
         b.ret_void()
 
-    def of_coefficients(self, stencil: Lowered) -> Taps:
-        return Taps(self.part, stencil, self.storage, self.grid, self.variant.room, written_out=_WRITTEN_OUT)
+    def of_coefficients(self, stencil: LoweredStencil) -> Sums:
+        return sums_of(self.part, stencil, self.storage, self.grid, self.variant.room, _WRITTEN_OUT)
 
     def _march_block(self) -> None:
         with self.traversal.every_ray() as (number, state):
@@ -416,7 +416,7 @@ class _Adjoint(_Program):
         number = STORAGE[variant.arithmetic]
         self.spreading = self.taps
         if number != self.storage:  # derivatives by the coefficients are kept in the arithmetic's type
-            self.spreading = _Parts(e, Taps(self.part, variant.stencil, number, self.grid))
+            self.spreading = _Parts(e, sums_of(self.part, variant.stencil, number, self.grid))
         if variant.derivatives is not None:
             self.raised = variant.derivatives[1]
             self.differentiating = _Parts(e, self.of_coefficients(variant.derivatives[0]))

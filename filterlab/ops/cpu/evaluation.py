@@ -12,7 +12,7 @@ from filterlab.ops.cpu.memory import fresh
 from filterlab.ops.cpu.place import Placing
 from filterlab.ops.gather import readable
 from filterlab.ops.place import Placed, Placement
-from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 
 
 class Evaluator:
@@ -23,7 +23,7 @@ class Evaluator:
     """
 
     def __init__(
-        self, coefficients: Tensor, placement: Placement, stencil: Stencil, start: int, dtype: torch.dtype
+        self, coefficients: Tensor, placement: Placement, stencil: AnyStencil, start: int, dtype: torch.dtype
     ) -> None:
         self.place = Placing(placement, dtype)
         self.gather = Gathering(coefficients, stencil, start, dtype)

@@ -23,7 +23,7 @@ from filterlab.ops.cpu.order import Sorted
 from filterlab.ops.cpu.place import Placing
 from filterlab.ops.cpu.points import BLOCK, PointsJob, PointsVariant
 from filterlab.ops.gather import STORAGE, readable
-from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 
 FEWEST_SORTED = 1 << 16  # points of a batch entry
 SMALLEST_SORTED_IN = 16 << 20  # bytes of one channel
@@ -32,7 +32,7 @@ SPLAT_MEMORY = 1 << 30  # bytes that scatter may take for partial results beyond
 _POINTS_PER_THREAD = 4096  # fewer are not worth waking a thread for
 
 
-def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
+def gather(coefficients: Tensor, points: Tensor, stencil: AnyStencil, start: int = 0) -> Tensor:
     """`ops.reference.gather.gather`, fused."""
     return Gathering(coefficients, stencil, start, points.dtype)(points)
 
@@ -46,7 +46,7 @@ class Gathering:
         dtype: of the points.
     """
 
-    def __init__(self, coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dtype) -> None:
+    def __init__(self, coefficients: Tensor, stencil: AnyStencil, start: int, dtype: torch.dtype) -> None:
         self.coefficients = readable(coefficients, 2)
         self.channels, self.rows, self.start = coefficients.shape[1], len(stencil.rows), start
         self.dtype, self.program = dtype, Program.of("gather", self.coefficients, stencil, start, dtype)
@@ -78,7 +78,7 @@ class Gathering:
                 ordered.restore(rows[0, channel], out[entry, channel, :, part])
 
 
-def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int], start: int = 0) -> Tensor:
+def scatter(cotangents: Tensor, points: Tensor, stencil: AnyStencil, shape: Sequence[int], start: int = 0) -> Tensor:
     """`ops.reference.gather.scatter`, fused.
 
     Each thread takes an equal share of the points and adds into a partial result of its own; these are summed at the
@@ -107,7 +107,7 @@ def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequenc
     return out.contiguous()
 
 
-def pull(coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
+def pull(coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: AnyStencil, start: int = 0) -> Tensor:
     """The adjoint of gather to its points, (N, M, 3): Σ over channels and rows of cotangent · gradient of the row."""
     if cotangents.numel() == 0 or points.numel() == 0:
         return torch.zeros_like(points)
@@ -179,7 +179,7 @@ class Program:
         cls,
         operation: str,
         volume: Tensor,
-        stencil: Stencil,
+        stencil: AnyStencil,
         start: int,
         dtype: torch.dtype,
         raised: tuple[tuple[int, ...], ...] = (),

@@ -175,6 +175,10 @@ class Lanes:
         """The larger one; b where either is NaN."""
         return self.builder.select(self.builder.fcmp_ordered(">", a, b), a, b)
 
+    def less(self, a: Value, b: Value) -> Value:
+        """A mask: a < b, false where either is NaN."""
+        return self.builder.fcmp_ordered("<", a, b)
+
     def differs(self, a: Value, number: float = 0.0) -> Value:
         """A mask: a ≠ number, NaN included."""
         return self.builder.fcmp_unordered("!=", a, self.constant(number))

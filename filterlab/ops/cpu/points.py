@@ -17,8 +17,9 @@ from llvmlite import ir
 from filterlab.ops.cpu import folding, frame, job
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import I1, I64, POINTER, STORAGE, Lanes, Value, Variable
-from filterlab.ops.cpu.taps import Grid, Location, Taps
-from filterlab.ops.stencil import Lowered
+from filterlab.ops.cpu.sums import sums_of
+from filterlab.ops.cpu.taps import Grid
+from filterlab.ops.tetrahedra import LoweredStencil
 
 BLOCK = 16  # packs that are located before the first of them is summed
 
@@ -66,7 +67,7 @@ class PointsVariant:
     """
 
     operation: str
-    stencil: Lowered
+    stencil: LoweredStencil
     arithmetic: str
     storage: str
     lanes: int
@@ -91,8 +92,8 @@ class _Program:
         e = self.lanes
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         grid = Grid.of(j)
-        self.location = Location(e, self.variant.stencil.supports, self.storage, grid)
-        self.taps = Taps(e, self.variant.stencil, self.storage, grid)
+        self.taps = sums_of(e, self.variant.stencil, self.storage, grid)
+        self.location = self.taps.location(e)
         self.scratch_points = e.reserve(e.number, 3 * e.count)
         self.scratch_rows = e.reserve(e.number, self.rows * e.count)
         self.addresses = e.reserve(I64, BLOCK * e.count)

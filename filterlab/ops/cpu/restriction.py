@@ -60,7 +60,7 @@ class Restriction(Taps):
     def _of_plane(self, taps: list[Value], offset: Value, weights: Weights, wz: dict[int, Polynomial]) -> Polynomial:
         pairs = self.stencil.pairs(wz)
         planes: dict[tuple[int, int], Polynomial] = {}
-        for y, line in self._fetch_lines(taps, offset, self._needed(pairs)):
+        for y, line in self.lines.fetch(taps, offset, self._needed(pairs)):
             for a in sorted({a for a, _ in pairs}):
                 along = self._along_x(line, weights[0][a])
                 for own, b in pairs:

@@ -55,7 +55,7 @@ Measured with AVX-512 (Zen 5), coefficients in the cache: 0.8 times the time of 
 _ROWS_WITH_LINES = 4
 """Sums of more rows need the registers themselves: the gradient to points of a tricubic jet took 1.25 × the time."""
 
-_WRITTEN_OUT = 6
+WRITTEN_OUT = 6
 
 Weights = list[list[list[Value | None]]]
 """[axis][function][t]: the weight of tap t, a pack; None where the function has none."""
@@ -115,12 +115,16 @@ class Location:
             volume: address of coefficient 0.
         """
         e, b = self.lanes, self.builder
-        (x, y, z), u = zip(*self.cells(points), strict=True)
+        (x, y, z), u = zip(*self.located(points), strict=True)
         size = I64(self.storage.bytes)
         line = b.add(b.mul(z, e.everywhere(b.trunc(self.grid.height, I32))), y)
         line_size = e.widen(e.everywhere(b.trunc(b.mul(self.grid.width, size), I32)))
         offset = b.add(b.mul(e.widen(line), line_size), b.mul(e.widen(x), e.everywhere(size)))
         return b.add(offset, e.everywhere(b.ptrtoint(volume, I64))), list(u)  # 64 bits: volumes may be large
+
+    def located(self, points: Sequence[Value]) -> list[tuple[Value, Value]]:
+        """What `locate` gives, along x, y, z."""
+        return self.cells(points)
 
     def cells(self, points: Sequence[Value]) -> list[tuple[Value, Value]]:
         """Along x, y, z: every lane's first tap, counted from coefficient 0 (32 bits), and its u."""
@@ -135,6 +139,106 @@ class Location:
         u = e.multiply_add(shifted, e.constant(0), e.subtract(shifted, base))  # 0 · ∞ = NaN: no value at infinity
         start = e.everywhere(b.trunc(self.grid.start, I32))
         return b.sub(e.to_integer(base), start), u
+
+
+class Lines:
+    """Reads lines of taps, and adds to them, each lane its own.
+
+    Args:
+        lanes: writer of instructions.
+        storage: how coefficients lie in memory; to be added to in the type of the arithmetic.
+        grid: where they lie.
+        room: see `Taps`.
+        rows: that are summed from what is read.
+    """
+
+    def __init__(self, lanes: Lanes, storage: Storage, grid: Grid, room: bool = False, rows: int = 1) -> None:
+        self.lanes, self.builder = lanes, lanes.builder
+        self.storage, self.grid, self.room = storage, grid, room
+        wide = lanes.count * lanes.bits >= 512
+        self.written_at_once = _LINES_AT_ONCE if wide else 1
+        self.read_at_once = _LINES_AT_ONCE if wide and rows <= _ROWS_WITH_LINES else 1
+
+    def _pieces(self, plane_offset: Value, needed: dict[int, range], at_once: int) -> list[list[_Piece]]:
+        """Lines of taps in pieces of at most four, as many at a time as there are registers for."""
+        e, b = self.lanes, self.builder
+        pieces = []
+        for y, taps in needed.items():
+            offset = e.opaque(b.add(plane_offset, b.mul(self.grid.width, I64(y))))
+            starts = range(taps.start, taps.stop, 4)
+            pieces += [_Piece(y, range(first, min(first + 4, taps.stop)), offset) for first in starts]
+        return [pieces[i : i + at_once] for i in range(0, len(pieces), at_once)]
+
+    def _address(self, tap: Value, piece: _Piece) -> Value:
+        """Of the first number of a piece, from a lane's first tap."""
+        e, raw = self.lanes, self.storage.raw
+        return e.advance(e.advance(tap, piece.offset, raw), I64(piece.taps.start), raw)
+
+    def fetch(
+        self, taps: list[Value], plane_offset: Value, needed: dict[int, range]
+    ) -> Iterator[tuple[int, dict[int, Value]]]:
+        """(y, {x: tap x of every lane}) for the lines y, one after the other.
+
+        A lane's address is loaded once for several lines: there are more lanes than registers for addresses.
+        """
+        e = self.lanes
+        found: dict[int, dict[int, Value]] = {y: {} for y in needed}
+        for pieces in self._pieces(plane_offset, needed, self.read_at_once):
+            read = {lane: [self._read(taps[lane], piece) for piece in pieces] for lane in self._as_joined()}
+            for i, piece in enumerate(pieces):
+                packs = self._transposed([read[lane][i] for lane in range(e.count)], len(piece.taps))
+                found[piece.y] |= zip(piece.taps, (e.convert(p, self.storage) for p in packs), strict=True)
+            yield from ((y, found.pop(y)) for y in list(found) if len(found[y]) == len(needed[y]))
+
+    def _as_joined(self) -> list[int]:
+        """The first lane of every group, then the second of every group, …: those that are joined into one register."""
+        return [lane for k in range(4) for lane in range(k, self.lanes.count, 4)]
+
+    def _read(self, tap: Value, piece: _Piece) -> Value:
+        e, raw, count = self.lanes, self.storage.raw, len(piece.taps)
+        address = self._address(tap, piece)
+        return e.load(address, raw, count) if count <= 2 else e.load_quad(address, self.storage, count, self.room)
+
+    def _transposed(self, rows: list[Value], taps: int) -> list[Value]:
+        """Every lane's row of taps -> the first tap of every lane, the second of every lane, …"""
+        e = self.lanes
+        if taps == 1:
+            return [e.join(rows)]
+        if taps == 2:
+            return _transpose_pairs(e, [e.join(lanes_of_groups(rows, k)) for k in ((0, 1), (2, 3))])
+        return transpose_quads(e, [e.join(lanes_of_groups(rows, (k,))) for k in range(4)])[:taps]
+
+    def add(
+        self, taps: list[Value], plane_offset: Value, needed: dict[int, range], values: dict[int, list[Value]]
+    ) -> None:
+        """Add packs to every lane's lines of taps, one lane after the other: two lanes may share a coefficient.
+
+        All lines of a lane before the next lane's: what it adds to a line may wait for what the lane before stored.
+        Three taps are added as four, the fourth 0: one access instead of two, for which there is room behind the last
+        coefficient. Measured (Zen 5): 0.7 times the time.
+        """
+        e, b = self.lanes, self.builder
+        for pieces in self._pieces(plane_offset, needed, self.written_at_once):
+            rows = []
+            for piece in pieces:
+                first = needed[piece.y].start
+                packs = values[piece.y][piece.taps.start - first : piece.taps.stop - first]
+                rows.append(self._lines_of_lanes(packs))
+            for lane, tap in enumerate(taps):
+                for piece, row in zip(pieces, rows, strict=True):
+                    address = self._address(tap, piece)
+                    e.store(b.fadd(e.load(address, e.number, row[lane].type.count), row[lane]), address)
+
+    def _lines_of_lanes(self, packs: list[Value]) -> list[Value]:
+        """The inverse of `_transposed`: for every lane a vector of its taps, and a 0 behind three of them."""
+        e, taps = self.lanes, len(packs)
+        if taps == 1:
+            return [e.shuffle(packs[0], packs[0], [i]) for i in range(e.count)]
+        if taps == 2:
+            joined = _interleave_pairs(e, packs)
+            return [e.shuffle(joined[i % 4 // 2], joined[i % 4 // 2], _places(i, 2)) for i in range(e.count)]
+        joined = transpose_quads(e, [*packs, *[e.constant(0)] * (4 - taps)])
+        return [e.shuffle(joined[i % 4], joined[i % 4], _places(i, 4)) for i in range(e.count)]
 
 
 class Taps:
@@ -159,16 +263,18 @@ class Taps:
         storage: Storage,
         grid: Grid,
         room: bool = False,
-        written_out: int = _WRITTEN_OUT,
+        written_out: int = WRITTEN_OUT,
     ) -> None:
         self.lanes, self.builder = lanes, lanes.builder
         self.stencil, self.storage, self.grid = stencil, storage, grid
-        self.supports, self.room = stencil.supports, room
+        self.supports = stencil.supports
+        self.lines = Lines(lanes, storage, grid, room, len(stencil.rows))
         self.written_out = len(stencil.rows) * stencil.supports[2] <= written_out
-        wide = lanes.count * lanes.bits >= 512
-        self.written_at_once = _LINES_AT_ONCE if wide else 1
-        self.read_at_once = _LINES_AT_ONCE if wide and len(stencil.rows) <= _ROWS_WITH_LINES else 1
         self._plane_weights = lanes.reserve(lanes.pack, self.supports[2] * len(stencil.functions[2]))
+
+    def location(self, lanes: Lanes) -> Location:
+        """Of points in packs that may be longer."""
+        return Location(lanes, self.supports, self.storage, self.grid)
 
     def weigh(self, u: Sequence[Value]) -> Weights:
         """The weights of all taps, from `Location.locate`'s u; the loop over planes reads those along z from memory."""
@@ -205,7 +311,7 @@ class Taps:
             with self._every(planes, here) as (plane_offset, wz):
                 sums: dict[tuple[int, int], Value] = {}
                 pairs = self.stencil.pairs(wz)
-                for y, line in self._fetch_lines(taps, plane_offset, self._needed(pairs)):
+                for y, line in self.lines.fetch(taps, plane_offset, self._needed(pairs)):
                     self._contract_line(y, line, weights, pairs, sums)
                 for row, products in zip(rows, self.stencil.rows, strict=True):
                     for c, weight in wz.items():
@@ -254,7 +360,7 @@ class Taps:
                 sums = self._spread_planes(wz, cotangents)
                 needed = self._needed(list(sums))
                 values = {y: self._spread_line(y, taps_of_line, weights, sums) for y, taps_of_line in needed.items()}
-                self._add_lines(taps, plane_offset, needed, values)
+                self.lines.add(taps, plane_offset, needed, values)
 
     def _spread_line(self, y: int, needed: range, weights: Weights, sums: dict[tuple[int, int], Value]) -> list[Value]:
         """What is added to the needed taps of line y, a pack for each."""
@@ -311,89 +417,6 @@ class Taps:
         e, b, grid = self.lanes, self.builder, self.grid
         own = {c: e.load(self._plane_weight(z, c), e.number, e.count) for c in functions}
         return e.opaque(b.add(here, b.mul(b.mul(z, grid.height), grid.width))), own
-
-    # --- lines of taps in memory ---
-
-    def _pieces(self, plane_offset: Value, needed: dict[int, range], at_once: int) -> list[list[_Piece]]:
-        """Lines of taps in pieces of at most four, as many at a time as there are registers for."""
-        e, b = self.lanes, self.builder
-        pieces = []
-        for y, taps in needed.items():
-            offset = e.opaque(b.add(plane_offset, b.mul(self.grid.width, I64(y))))
-            starts = range(taps.start, taps.stop, 4)
-            pieces += [_Piece(y, range(first, min(first + 4, taps.stop)), offset) for first in starts]
-        return [pieces[i : i + at_once] for i in range(0, len(pieces), at_once)]
-
-    def _address(self, tap: Value, piece: _Piece) -> Value:
-        """Of the first number of a piece, from a lane's first tap."""
-        e, raw = self.lanes, self.storage.raw
-        return e.advance(e.advance(tap, piece.offset, raw), I64(piece.taps.start), raw)
-
-    def _fetch_lines(
-        self, taps: list[Value], plane_offset: Value, needed: dict[int, range]
-    ) -> Iterator[tuple[int, dict[int, Value]]]:
-        """(y, {x: tap x of every lane}) for the lines y, one after the other.
-
-        A lane's address is loaded once for several lines: there are more lanes than registers for addresses.
-        """
-        e = self.lanes
-        found: dict[int, dict[int, Value]] = {y: {} for y in needed}
-        for pieces in self._pieces(plane_offset, needed, self.read_at_once):
-            read = {lane: [self._read(taps[lane], piece) for piece in pieces] for lane in self._as_joined()}
-            for i, piece in enumerate(pieces):
-                packs = self._transposed([read[lane][i] for lane in range(e.count)], len(piece.taps))
-                found[piece.y] |= zip(piece.taps, (e.convert(p, self.storage) for p in packs), strict=True)
-            yield from ((y, found.pop(y)) for y in list(found) if len(found[y]) == len(needed[y]))
-
-    def _as_joined(self) -> list[int]:
-        """The first lane of every group, then the second of every group, …: those that are joined into one register."""
-        return [lane for k in range(4) for lane in range(k, self.lanes.count, 4)]
-
-    def _read(self, tap: Value, piece: _Piece) -> Value:
-        e, raw, count = self.lanes, self.storage.raw, len(piece.taps)
-        address = self._address(tap, piece)
-        return e.load(address, raw, count) if count <= 2 else e.load_quad(address, self.storage, count, self.room)
-
-    def _transposed(self, rows: list[Value], taps: int) -> list[Value]:
-        """Every lane's row of taps -> the first tap of every lane, the second of every lane, …"""
-        e = self.lanes
-        if taps == 1:
-            return [e.join(rows)]
-        if taps == 2:
-            return _transpose_pairs(e, [e.join(lanes_of_groups(rows, k)) for k in ((0, 1), (2, 3))])
-        return transpose_quads(e, [e.join(lanes_of_groups(rows, (k,))) for k in range(4)])[:taps]
-
-    def _add_lines(
-        self, taps: list[Value], plane_offset: Value, needed: dict[int, range], values: dict[int, list[Value]]
-    ) -> None:
-        """Add packs to every lane's lines of taps, one lane after the other: two lanes may share a coefficient.
-
-        All lines of a lane before the next lane's: what it adds to a line may wait for what the lane before stored.
-        Three taps are added as four, the fourth 0: one access instead of two, for which there is room behind the last
-        coefficient. Measured (Zen 5): 0.7 times the time.
-        """
-        e, b = self.lanes, self.builder
-        for pieces in self._pieces(plane_offset, needed, self.written_at_once):
-            rows = []
-            for piece in pieces:
-                first = needed[piece.y].start
-                packs = values[piece.y][piece.taps.start - first : piece.taps.stop - first]
-                rows.append(self._lines_of_lanes(packs))
-            for lane, tap in enumerate(taps):
-                for piece, row in zip(pieces, rows, strict=True):
-                    address = self._address(tap, piece)
-                    e.store(b.fadd(e.load(address, e.number, row[lane].type.count), row[lane]), address)
-
-    def _lines_of_lanes(self, packs: list[Value]) -> list[Value]:
-        """The inverse of `_transposed`: for every lane a vector of its taps, and a 0 behind three of them."""
-        e, taps = self.lanes, len(packs)
-        if taps == 1:
-            return [e.shuffle(packs[0], packs[0], [i]) for i in range(e.count)]
-        if taps == 2:
-            joined = _interleave_pairs(e, packs)
-            return [e.shuffle(joined[i % 4 // 2], joined[i % 4 // 2], _places(i, 2)) for i in range(e.count)]
-        joined = transpose_quads(e, [*packs, *[e.constant(0)] * (4 - taps)])
-        return [e.shuffle(joined[i % 4], joined[i % 4], _places(i, 4)) for i in range(e.count)]
 
 
 # --- transpositions; a group is four lanes --------------------------------------------------------------------------

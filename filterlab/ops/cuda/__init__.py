@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.gather import unsupported
-from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 
 _COORDINATES = {torch.float32: 1 << 24, torch.float64: 1 << 31}  # exact in the dtype
 
@@ -24,7 +24,7 @@ _COORDINATES = {torch.float32: 1 << 24, torch.float64: 1 << 31}  # exact in the 
 def missing(
     coefficients: Tensor,
     points: Tensor,
-    stencil: Stencil,
+    stencil: AnyStencil,
     shape: Sequence[int] | None = None,
     start: int = 0,
 ) -> str | None:

@@ -29,7 +29,7 @@ from filterlab.ops.cuda.source import Source
 from filterlab.ops.cuda.tape import Node, Tape
 from filterlab.ops.cuda.taps import AXES
 from filterlab.ops.march_derivatives import TABLE_ROW, columns_of_rays, gradient_columns
-from filterlab.ops.stencil import Lowered
+from filterlab.ops.tetrahedra import LoweredStencil
 
 TABLES = 64
 _ENDS = 10  # numbers of a row of the table that mean something
@@ -46,8 +46,8 @@ class AdjointVariant:
     """
 
     gradients: tuple[str, ...]
-    stencil: Lowered
-    derivatives: tuple[Lowered, tuple[tuple[int, ...], ...]] | None
+    stencil: LoweredStencil
+    derivatives: tuple[LoweredStencil, tuple[tuple[int, ...], ...]] | None
     lights: int | None
     skipping: bool
     even: bool

@@ -20,14 +20,14 @@ from filterlab.ops.cuda.optics import RGB
 from filterlab.ops.cuda.segments import Program
 from filterlab.ops.cuda.source import Source
 from filterlab.ops.cuda.tape import Node, Tape
-from filterlab.ops.stencil import Lowered
+from filterlab.ops.tetrahedra import LoweredStencil
 
 
 @dataclass(frozen=True)
 class MarchVariant:
     """See `ops.cuda.segments.RayVariant`."""
 
-    stencil: Lowered
+    stencil: LoweredStencil
     lights: int | None
     skipping: bool
     even: bool

@@ -18,13 +18,13 @@ from filterlab.ops.cuda import points as programs
 from filterlab.ops.cuda.launch import interpreting, launchable
 from filterlab.ops.gather import readable
 from filterlab.ops.reference import gather as reference
-from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 
 BLOCK = 128  # points of one program, one for each of its threads
 WARPS = BLOCK // 32
 
 
-def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
+def gather(coefficients: Tensor, points: Tensor, stencil: AnyStencil, start: int = 0) -> Tensor:
     """`ops.reference.gather`, fused. Nothing is copied but what is not contiguous within a channel or a batch entry."""
     n, c = coefficients.shape[:2]
     out = points.new_empty((n, c, len(stencil.rows), points.shape[1]))
@@ -33,7 +33,7 @@ def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 
     return out
 
 
-def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int], start: int = 0) -> Tensor:
+def scatter(cotangents: Tensor, points: Tensor, stencil: AnyStencil, shape: Sequence[int], start: int = 0) -> Tensor:
     """`ops.reference.scatter`, fused; it is the reference where torch is told to be deterministic."""
     if torch.are_deterministic_algorithms_enabled():
         return reference.scatter(cotangents, points, stencil, shape, start)
@@ -43,7 +43,9 @@ def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequenc
     return out
 
 
-def _launch(operation: str, coefficients: Tensor, points: Tensor, rows: Tensor, stencil: Stencil, start: int) -> None:
+def _launch(
+    operation: str, coefficients: Tensor, points: Tensor, rows: Tensor, stencil: AnyStencil, start: int
+) -> None:
     """One launch: programs for all blocks of all batch entries. `rows` (N, C, J, M) is contiguous."""
     entries, count = points.shape[:2]
     arguments = (coefficients, points, rows, count, *coefficients.shape[1:], start)
@@ -54,5 +56,5 @@ def _launch(operation: str, coefficients: Tensor, points: Tensor, rows: Tensor, 
 
 
 @lru_cache(maxsize=1024)
-def _program(operation: str, stencil: Stencil, interpreted: bool) -> Any:
+def _program(operation: str, stencil: AnyStencil, interpreted: bool) -> Any:
     return launchable({"gather": programs.gather, "scatter": programs.scatter}[operation](stencil.lowered))

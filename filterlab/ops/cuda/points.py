@@ -8,8 +8,8 @@ they read coefficients that exist; they write nothing.
 from __future__ import annotations
 
 from filterlab.ops.cuda.source import Source
-from filterlab.ops.cuda.taps import Taps
-from filterlab.ops.stencil import Lowered
+from filterlab.ops.cuda.sums import Sums, sums_of
+from filterlab.ops.tetrahedra import LoweredStencil
 
 SIZES = (
     "count",  # M
@@ -26,7 +26,7 @@ PARAMETERS = ("coefficients", "points", "rows", *SIZES, "BLOCK: tl.constexpr")
 """coefficients (N, C, D, H, W), points (N, M, 3), rows (N, C, J, M) contiguous."""
 
 
-def gather(stencil: Lowered) -> Source:
+def gather(stencil: LoweredStencil) -> Source:
     """rows[n, c, :, m] = the rows of the stencil at points[n, m]."""
     source, taps = _head("gather", stencil)
     with source.block("for _ in range(channels)"):
@@ -37,7 +37,7 @@ def gather(stencil: Lowered) -> Source:
     return source
 
 
-def scatter(stencil: Lowered) -> Source:
+def scatter(stencil: LoweredStencil) -> Source:
     """coefficients += the transpose of `gather` applied to the rows. A point that is not finite adds nothing."""
     source, taps = _head("scatter", stencil)
     source.line("known = inside & (nothing == 0.0)")
@@ -49,10 +49,10 @@ def scatter(stencil: Lowered) -> Source:
     return source
 
 
-def _head(name: str, stencil: Lowered) -> tuple[Source, Taps]:
+def _head(name: str, stencil: LoweredStencil) -> tuple[Source, Sums]:
     """Everything before the channels: which points, where they read, the weights, where their rows are."""
     source = Source(name, PARAMETERS)
-    taps = Taps(source, stencil)
+    taps = sums_of(source, stencil)
     line = source.line
     for size in SIZES:
         line(
@@ -74,6 +74,6 @@ def _head(name: str, stencil: Lowered) -> tuple[Source, Taps]:
     return source, taps
 
 
-def _next_channel(source: Source, stencil: Lowered) -> None:
+def _next_channel(source: Source, stencil: LoweredStencil) -> None:
     source.line("first += coefficients_channel")
     source.line(f"here += {len(stencil.rows)} * count")

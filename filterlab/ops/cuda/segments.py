@@ -20,9 +20,10 @@ from typing import Protocol
 
 from filterlab.ops.cuda.optics import Lights, shade
 from filterlab.ops.cuda.source import Source
+from filterlab.ops.cuda.sums import Sums, sums_of
 from filterlab.ops.cuda.tape import Node, Tape
-from filterlab.ops.cuda.taps import AXES, Taps
-from filterlab.ops.stencil import Lowered
+from filterlab.ops.cuda.taps import AXES
+from filterlab.ops.tetrahedra import LoweredStencil
 
 BLOCK = 32  # rays of a program; a warp
 
@@ -48,7 +49,7 @@ class RayVariant(Protocol):
     """
 
     @property
-    def stencil(self) -> Lowered: ...
+    def stencil(self) -> LoweredStencil: ...
     @property
     def lights(self) -> int | None: ...
     @property
@@ -81,8 +82,8 @@ class Program:
         self.taps = self.taps_of(variant.stencil)
         self.lights, self.skipping, self.even = variant.lights, variant.skipping, variant.even
 
-    def taps_of(self, stencil: Lowered) -> Taps:
-        return Taps(self.source, stencil, WRITTEN_OUT)
+    def taps_of(self, stencil: LoweredStencil) -> Sums:
+        return sums_of(self.source, stencil, WRITTEN_OUT)
 
     def begin(self) -> None:
         raise NotImplementedError

@@ -34,6 +34,18 @@ Plane = tuple[str, dict[int, str]]
 """The number of a plane, and the weight of every function along z that has one there; as text."""
 
 
+def first_taps(source: Source, supports: Sequence[int]) -> None:
+    """From x, y, z: the number of the first tap along every axis, ix, iy, iz, and the local coordinates ux, uy, uz."""
+    line = source.line
+    for axis, size, support in zip(AXES, SIZES, supports, strict=True):
+        line(f"shifted = {axis} - {number(support / 2 - 1)}")
+        line("base = tl.floor(shifted)")
+        line("base = tl.where(base > start, base, start)  # NaN too: no comparison with it is true")
+        line(f"base = tl.where(base < start + {size} - {support}, base, start + {size} - {support})")
+        line(f"u{axis} = shifted - base")
+        line(f"i{axis} = base.to(tl.int64) - start")
+
+
 class Taps:
     """Writes the sums of a stencil at the end of a source.
 
@@ -54,13 +66,7 @@ class Taps:
         """From x, y, z: the number of the first tap, `cell`, and its address `first` in the channel at `volume`; the
         local coordinates ux, uy, uz; and `nothing`, which is 0 where the point is finite and NaN elsewhere."""
         line = self.source.line
-        for axis, size, support in zip(AXES, SIZES, self.stencil.supports, strict=True):
-            line(f"shifted = {axis} - {number(support / 2 - 1)}")
-            line("base = tl.floor(shifted)")
-            line("base = tl.where(base > start, base, start)  # NaN too: no comparison with it is true")
-            line(f"base = tl.where(base < start + {size} - {support}, base, start + {size} - {support})")
-            line(f"u{axis} = shifted - base")
-            line(f"i{axis} = base.to(tl.int64) - start")
+        first_taps(self.source, self.stencil.supports)
         line("cell = (iz * height + iy) * width + ix")
         line(f"first = {volume} + cell")
         line("nothing = ux * 0.0 + uy * 0.0 + uz * 0.0")

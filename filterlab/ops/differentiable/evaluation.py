@@ -14,7 +14,7 @@ from filterlab.ops.differentiable.gather import gather
 from filterlab.ops.differentiable.place import place
 from filterlab.ops.differentiable.recording import plain
 from filterlab.ops.place import Placed, Placement
-from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 
 if TYPE_CHECKING:
     from filterlab.ops.cpu.evaluation import Evaluator
@@ -35,7 +35,7 @@ class Evaluation:
 
     coefficients: Tensor
     placement: Placement
-    stencil: Stencil
+    stencil: AnyStencil
     start: int
     implementation: str
     _prepared: dict[torch.dtype, Evaluator] = field(default_factory=dict, repr=False)

@@ -23,15 +23,15 @@ from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.gather import MAX_ORDER
 from filterlab.ops.reference import gather as reference
-from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 
 
 class Sums(Protocol):
     """What computes a gather and a scatter, without derivatives; see `ops.reference.gather` for the meaning."""
 
-    def gather(self, coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0) -> Tensor: ...
+    def gather(self, coefficients: Tensor, points: Tensor, stencil: AnyStencil, start: int = 0) -> Tensor: ...
     def scatter(
-        self, cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int], start: int = 0
+        self, cotangents: Tensor, points: Tensor, stencil: AnyStencil, shape: Sequence[int], start: int = 0
     ) -> Tensor: ...
 
 
@@ -56,7 +56,7 @@ class Implementation:
         """What computes it, imported at its first use."""
         return driver(self.name, "gather")
 
-    def of(self, stencil: Stencil) -> Sums:
+    def of(self, stencil: AnyStencil) -> Sums:
         """What computes this stencil: the reference where its order is too high."""
         return reference if self.max_order is not None and stencil.order > self.max_order else self.sums
 
@@ -68,20 +68,20 @@ IMPLEMENTATIONS: dict[str, Implementation] = {
 }
 
 
-def missing(implementation: str, values: Tensor, points: Tensor, stencil: Stencil, *sizes) -> str | None:
+def missing(implementation: str, values: Tensor, points: Tensor, stencil: AnyStencil, *sizes) -> str | None:
     """What an implementation lacks to gather (or scatter) as asked; None: nothing. See `ops.cpu.missing`."""
     asked = IMPLEMENTATIONS[implementation].missing
     return None if asked is None else asked(values, points, stencil, *sizes)
 
 
-def _along_axes(raised: Tensor, stencil: Stencil) -> Tensor:
+def _along_axes(raised: Tensor, stencil: AnyStencil) -> Tensor:
     """(N, C, J', M) of the stencil's derivatives -> (3, N, C, J, M): the derivative of every row along x, y, z."""
     index = torch.tensor(stencil.derivatives[1], device=raised.device)
     return torch.stack([raised.index_select(2, index[axis]) for axis in range(3)])
 
 
 def pull(
-    coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: Stencil, start: int, implementation: str
+    coefficients: Tensor, points: Tensor, cotangents: Tensor, stencil: AnyStencil, start: int, implementation: str
 ) -> Tensor:
     """The adjoint of gather to its points, (N, M, 3); in one pass where no derivative of it is asked."""
     alone = not transformed() and (not torch.is_grad_enabled() or plain(coefficients, points, cotangents))
@@ -92,7 +92,7 @@ def pull(
     return gradient_to_points(raised, cotangents, stencil)
 
 
-def gradient_to_points(raised: Tensor, cotangents: Tensor, stencil: Stencil) -> Tensor:
+def gradient_to_points(raised: Tensor, cotangents: Tensor, stencil: AnyStencil) -> Tensor:
     """(N, M, 3): Σ over channels and rows of cotangent · derivative of the row."""
     return torch.einsum("ncjm,ancjm->nma", cotangents, _along_axes(raised, stencil))
 
@@ -101,7 +101,7 @@ class Gather(torch.autograd.Function):
     """(coefficients (N,C,D,H,W), points (N,M,3), stencil, start, implementation) -> (N, C, J, M)."""
 
     @staticmethod
-    def forward(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int, implementation: str) -> Tensor:
+    def forward(coefficients: Tensor, points: Tensor, stencil: AnyStencil, start: int, implementation: str) -> Tensor:
         return IMPLEMENTATIONS[implementation].of(stencil).gather(coefficients, points, stencil, start)
 
     @staticmethod
@@ -135,7 +135,7 @@ class Gather(torch.autograd.Function):
         return out
 
     @staticmethod
-    def vmap(info, in_dims, coefficients: Tensor, points: Tensor, stencil: Stencil, *rest):
+    def vmap(info, in_dims, coefficients: Tensor, points: Tensor, stencil: AnyStencil, *rest):
         volume_dim, point_dim = in_dims[:2]
         b = info.batch_size
         if point_dim is None:  # one set of points: the batch joins the channels
@@ -155,7 +155,7 @@ class Scatter(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        cotangents: Tensor, points: Tensor, stencil: Stencil, shape: tuple[int, ...], start: int, implementation: str
+        cotangents: Tensor, points: Tensor, stencil: AnyStencil, shape: tuple[int, ...], start: int, implementation: str
     ) -> Tensor:
         return IMPLEMENTATIONS[implementation].of(stencil).scatter(cotangents, points, stencil, shape, start)
 
@@ -194,7 +194,7 @@ class Scatter(torch.autograd.Function):
         return out
 
     @staticmethod
-    def vmap(info, in_dims, cotangents: Tensor, points: Tensor, stencil: Stencil, shape, *rest):
+    def vmap(info, in_dims, cotangents: Tensor, points: Tensor, stencil: AnyStencil, shape, *rest):
         cotangent_dim, point_dim = in_dims[:2]
         b = info.batch_size
         if point_dim is None:
@@ -208,7 +208,7 @@ class Scatter(torch.autograd.Function):
 
 
 def gather(
-    coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0, implementation: str = "reference"
+    coefficients: Tensor, points: Tensor, stencil: AnyStencil, start: int = 0, implementation: str = "reference"
 ) -> Tensor:
     if not stencil.exact:  # tables that are tensors: torch differentiates the sum itself, in them too
         return reference.gather(coefficients, points, stencil, start)
@@ -220,7 +220,7 @@ def gather(
 def scatter(
     cotangents: Tensor,
     points: Tensor,
-    stencil: Stencil,
+    stencil: AnyStencil,
     shape: tuple[int, ...],
     start: int = 0,
     implementation: str = "reference",

@@ -25,7 +25,7 @@ from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.march import MAX_LIGHTS, Bricks, March
 from filterlab.ops.march_derivatives import GRADIENTS, MEMBERS
 from filterlab.ops.reference import march as reference
-from filterlab.ops.stencil import Stencil
+from filterlab.ops.tetrahedra import AnyStencil
 
 Report = Callable[[int], None]
 """Is given the number of rays done, now and then."""
@@ -39,7 +39,7 @@ def implementation_for(coefficients: Tensor) -> str:
     return "cuda" if coefficients.device.type == "cuda" else "cpu"
 
 
-def missing(coefficients: Tensor, stencil: Stencil, start: int, dtype: torch.dtype, lights: int) -> str | None:
+def missing(coefficients: Tensor, stencil: AnyStencil, start: int, dtype: torch.dtype, lights: int) -> str | None:
     """What keeps the march from running here as asked; None: nothing does.
 
     Args:

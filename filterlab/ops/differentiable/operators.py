@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import asdict
 from fractions import Fraction
 from functools import lru_cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from torch import Tensor
 from torch.library import custom_op
@@ -21,6 +22,7 @@ from filterlab.ops.differentiable import gather as sums
 from filterlab.ops.differentiable import place as placement
 from filterlab.ops.place import Placement
 from filterlab.ops.stencil import Product, Stencil
+from filterlab.ops.tetrahedra import AnyStencil, Tetrahedra, TetrahedralStencil
 from filterlab.volume import Boundary, Geometry
 
 _Function = TypeVar("_Function", bound=Callable[..., str])
@@ -33,8 +35,10 @@ def _constant(function: _Function) -> _Function:
 
 
 @_constant
-def stencil_text(stencil: Stencil) -> str:
+def stencil_text(stencil: AnyStencil) -> str:
     """The stencil as JSON; `stencil_of` is the inverse."""
+    if isinstance(stencil, TetrahedralStencil):
+        return json.dumps({"spline": asdict(stencil.spline), "orders": stencil.orders}, separators=(",", ":"))
     kernels = list(dict.fromkeys(k for row in stencil.rows for p in row for k in p.kernels))
     tables = [[k.name, [[str(c) for c in piece] for piece in k.pieces]] for k in kernels]  # type: ignore[attr-defined]
     rows = [[[p.weight, [kernels.index(k) for k in p.kernels], p.orders] for p in row] for row in stencil.rows]
@@ -42,8 +46,12 @@ def stencil_text(stencil: Stencil) -> str:
 
 
 @lru_cache(maxsize=1024)
-def stencil_of(text: str) -> Stencil:
-    tables, rows = json.loads(text)
+def stencil_of(text: str) -> AnyStencil:
+    known = json.loads(text)
+    if isinstance(known, dict):
+        spline = Tetrahedra(**{name: _tuples(value) for name, value in known["spline"].items()})
+        return TetrahedralStencil(spline, _tuples(known["orders"]))
+    tables, rows = known
     kernels = [Kernel(name, tuple(tuple(Fraction(c) for c in piece) for piece in pieces)) for name, pieces in tables]
     return Stencil(
         tuple(
@@ -54,6 +62,11 @@ def stencil_of(text: str) -> Stencil:
             for row in rows
         )
     )
+
+
+def _tuples(value: Any) -> Any:
+    """Lists of JSON as the tuples they were."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 @_constant

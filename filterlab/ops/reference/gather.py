@@ -15,7 +15,9 @@ import torch
 from torch import Tensor
 
 from filterlab.kernels import PiecewisePolynomial, differentiate, horner
+from filterlab.ops.reference import tetrahedra
 from filterlab.ops.stencil import Product, Stencil
+from filterlab.ops.tetrahedra import AnyStencil, TetrahedralStencil
 
 CHUNK = 1 << 15  # points at a time: temporaries stay in cache and memory does not grow with M
 CHUNK_OF_GPU = 1 << 21  # enough for all of its cores
@@ -123,7 +125,7 @@ def _add(out: Tensor, first: Tensor, offset: int, values: Tensor) -> None:
         out[:, offset:].index_add_(1, first, values)
 
 
-def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 0) -> Tensor:
+def gather(coefficients: Tensor, points: Tensor, stencil: AnyStencil, start: int = 0) -> Tensor:
     """The rows of a stencil at the points.
 
     Args:
@@ -139,7 +141,11 @@ def gather(coefficients: Tensor, points: Tensor, stencil: Stencil, start: int = 
     flat = coefficients.transpose(0, 1).reshape(c, n * math.prod(coefficients.shape[2:]))
     parts = []
     for _, chunk, offset in _chunks(coefficients.shape, points):
-        parts.append(_contract(flat, _Reads(chunk, offset, stencil, coefficients.shape, start), chunk.dtype))
+        if isinstance(stencil, TetrahedralStencil):
+            at = tetrahedra.Reads(chunk, stencil, coefficients.shape, start)
+            parts.append(tetrahedra.contract(flat, at, offset, chunk.dtype))
+        else:
+            parts.append(_contract(flat, _Reads(chunk, offset, stencil, coefficients.shape, start), chunk.dtype))
     rows = len(stencil.rows)
     if not parts:
         return points.new_zeros((n, c, rows, points.shape[1]))
@@ -182,7 +188,7 @@ def _accumulate(sums: dict, key: object, weight: Tensor, value: Tensor, factor: 
         sums[key] = weight * value if factor == 1 else factor * (weight * value)
 
 
-def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequence[int], start: int = 0) -> Tensor:
+def scatter(cotangents: Tensor, points: Tensor, stencil: AnyStencil, shape: Sequence[int], start: int = 0) -> Tensor:
     """The transpose of `gather`: Σ over points and rows of cotangent · weight, added up in a coefficient array.
 
     Args:
@@ -199,8 +205,11 @@ def scatter(cotangents: Tensor, points: Tensor, stencil: Stencil, shape: Sequenc
     flat = cotangents.permute(2, 1, 0, 3).reshape(cotangents.shape[2], c, n * points.shape[1])  # (J, C, N·M)
     for part, chunk, offset in _chunks(full, points):
         known = chunk.isfinite().all(-1)
-        own = torch.where(known, flat[..., part].to(points.dtype), 0)
-        _spread(out, own, _Reads(torch.where(known[:, None], chunk, 0), offset, stencil, full, start))
+        own, chunk = torch.where(known, flat[..., part].to(points.dtype), 0), torch.where(known[:, None], chunk, 0)
+        if isinstance(stencil, TetrahedralStencil):
+            tetrahedra.spread(out, own, tetrahedra.Reads(chunk, stencil, full, start), offset)
+        else:
+            _spread(out, own, _Reads(chunk, offset, stencil, full, start))
     return out.reshape(c, n, *shape).transpose(0, 1)
 
 

@@ -21,7 +21,6 @@ from torch.utils.checkpoint import checkpoint
 from filterlab.ops.march import Chords, Lighting, March
 from filterlab.ops.reference.gather import gather as plain_gather
 from filterlab.ops.reference.optics import Table, absorbed, shade
-from filterlab.ops.stencil import Stencil
 
 Report = Callable[[int], None]
 """Is told how many samples of the current part are done."""
@@ -154,7 +153,7 @@ class _Described:
 
     def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         given = self.given
-        stencil = Stencil(given.stencil.rows[: 1 + 3 * order])
+        stencil = given.stencil.up_to(order)
         value, *gradient = self.gather(given.coefficients[None, None], points[None], stencil, given.start)[0, 0]
         return (value, torch.stack(gradient, -1) @ self._lighting.world) if gradient else (value,)
 

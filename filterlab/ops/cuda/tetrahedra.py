@@ -1,0 +1,103 @@
+"""The sums of splines on tetrahedra in Triton: `ops.tetrahedra.Sum`, line by line; what `taps` is for sums over taps.
+
+Each thread reads the samples of its own tetrahedron, along axes that are turned into the cone already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from filterlab.ops.cuda.source import Source, number
+from filterlab.ops.cuda.taps import AXES, SIZES, first_taps
+from filterlab.ops.tetrahedra import Sum, TetrahedralStencil
+
+
+class Text:
+    """The arithmetic of names: every operation is a line that names its result."""
+
+    def __init__(self, source: Source) -> None:
+        self._source, self._count = source, 0
+
+    def named(self, expression: str) -> str:
+        self._count += 1
+        name = f"t{self._count}"
+        self._source.line(f"{name} = {expression}")
+        return name
+
+    def constant(self, value: float) -> str:
+        return number(value)
+
+    def add(self, a: str, b: str) -> str:
+        return self.named(f"{a} + {b}")
+
+    def subtract(self, a: str, b: str) -> str:
+        return self.named(f"{a} - {b}")
+
+    def multiply(self, a: str, b: str) -> str:
+        return self.named(f"{a} * {b}")
+
+    def multiply_add(self, a: str, b: str, c: str | None) -> str:
+        return self.named(f"{a} * {b}" if c is None else f"{a} * {b} + {c}")
+
+    def negate(self, a: str) -> str:
+        return self.named(f"-{a}")
+
+    def absolute(self, a: str) -> str:
+        return self.named(f"tl.abs({a})")
+
+    def floor(self, a: str) -> str:
+        return self.named(f"tl.floor({a})")
+
+    def less(self, a: str, b: str) -> str:
+        return self.named(f"{a} < {b}")
+
+    def where(self, mask: str, a: str, b: str) -> str:
+        return self.named(f"tl.where({mask}, {a}, {b})")
+
+
+class TetrahedralTaps:
+    """Writes the sums of a stencil at the end of a source; see `Taps`."""
+
+    def __init__(self, source: Source, stencil: TetrahedralStencil) -> None:
+        self.source, self.stencil = source, stencil
+        self.text = Text(source)
+        self.sum = Sum(self.text, stencil)
+
+    def locate(self, volume: str) -> None:
+        """As `Taps.locate`, but that `first` is the address of the coefficient of the index of a point's cell."""
+        line, (before, behind) = self.source.line, self.sum.spline.reach
+        first_taps(self.source, self.stencil.supports)
+        for axis, size, cell in zip(AXES, SIZES, self.sum.cells(AXES), strict=True):
+            line(f"own = tl.where({cell} > start + {before}, {cell}, start + {before})  # NaN too")
+            line(f"own = tl.where(own < start + {size} - {behind + 1}, own, start + {size} - {behind + 1})")
+            line(f"u{axis} = {self.sum.local(axis, 'own')} + {axis} * 0.0")
+            line(f"cell_{axis} = own.to(tl.int64) - start")
+        line(f"first = {volume} + ((cell_z * height + cell_y) * width + cell_x)")
+        line("nothing = ux * 0.0 + uy * 0.0 + uz * 0.0")
+
+    def weigh(self) -> None:
+        """The points in the cone, and where their samples lie."""
+        text, strides = self.text, ("1", "width", "width * height")
+        self.turned = self.sum.turn([f"u{axis}" for axis in AXES])
+        signed = [text.where(n, f"-({s})", s) for n, s in zip(self.turned.negative, strides, strict=True)]
+        along = self.sum.along_cone(self.turned, signed)
+        halves = " + ".join(f"{step} - {axis}" for step, axis in zip(strides, signed, strict=True))
+        begin = text.named(f"({halves}) // 2" if self.sum.spline.octahedral else "ux.to(tl.int64) * 0")
+        self.offsets = [self._moved(begin, along, steps) for steps in self.sum.spline.steps]
+
+    def _moved(self, begin: str, along: Sequence[str], steps: Sequence[int]) -> str:
+        terms = [f"{step} * {axis}" for step, axis in zip(steps, along, strict=True) if step]
+        return self.text.named(" + ".join([begin, *terms]))
+
+    def contract(self, tap: str, rows: str = "row") -> None:
+        """See `Taps.contract`."""
+        samples = [self.text.named(f"tl.load({tap} + {offset}).to(arithmetic)") for offset in self.offsets]
+        for r, row in enumerate(self.sum.contract_samples(samples, self.turned)):
+            self.source.line(f"{rows}_{r} = {row}")
+
+    def spread(self, tap: str, mask: str, rows: str = "row") -> None:
+        """See `Taps.spread`."""
+        cotangents = [f"{rows}_{r}" for r in range(len(self.stencil.rows))]
+        for offset, value in zip(self.offsets, self.sum.spread_samples(cotangents, self.turned), strict=True):
+            if value is not None:
+                self.source.line(f'tl.atomic_add({tap} + {offset}, {value}, {mask}, sem="relaxed")')

@@ -1,0 +1,457 @@
+"""Sums of splines on tetrahedra: stencils of another kind, described, and written once for every arithmetic.
+
+A row of the stencil is a derivative of a spline at a point x, from samples at the integers. Where x is in its cell, of
+which each has the same tetrahedra under the signed permutations of the axes, decides what is summed:
+
+    u = x − centre of the cell ─▶ the cone a ≥ b ≥ c ≥ 0: signs, and three exchanges of neighbouring axes
+      ─▶ one of the shapes there, barycentric λ ─▶ Bernstein coefficients, masks of samples along the turned axes
+      ─▶ de Casteljau: value and derivatives along the cone's axes ─▶ turned back
+
+`Sum` writes that, and its transpose, in an `Arithmetic`: instructions of a program, lines of another, or tensors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import product
+from typing import Any, Protocol
+
+from filterlab.bernstein import Index
+from filterlab.bernstein import multi_indices as bernstein_indices
+from filterlab.ops.stencil import Lowered, MultiIndex, Stencil, multi_indices
+
+Value = Any
+"""Numbers of an arithmetic, one for each of the points that it works on at a time; masks and integers too."""
+
+Steps = tuple[int, int, int]
+Block = dict[Steps, Value]
+"""Samples by their places along three axes."""
+
+Rows = dict[MultiIndex, Value]
+"""All partial derivatives of some orders, each order whole."""
+
+_EXCHANGES = ((0, 1), (1, 2), (0, 1))
+"""Of neighbours that stand in the wrong order, to sort three."""
+
+
+class Arithmetic(Protocol):
+    """What sums are written in."""
+
+    def constant(self, value: float, /) -> Value: ...
+    def add(self, a: Value, b: Value, /) -> Value: ...
+    def subtract(self, a: Value, b: Value, /) -> Value: ...
+    def multiply(self, a: Value, b: Value, /) -> Value: ...
+    def multiply_add(self, a: Value, b: Value, c: Value | None, /) -> Value: ...
+    def negate(self, a: Value, /) -> Value: ...
+    def absolute(self, a: Value, /) -> Value: ...
+    def floor(self, a: Value, /) -> Value: ...
+    def less(self, a: Value, b: Value, /) -> Value: ...
+    def where(self, mask: Value, a: Value, b: Value, /) -> Value: ...
+
+
+@dataclass(frozen=True)
+class Tetrahedra:
+    """A spline as numbers: what a generator of code needs to know, and nothing else.
+
+    Attributes:
+        octahedral: whether cells are the octahedra about (i, j, k) + ½, i, j, k all even or all odd, else cubes about
+            the integers.
+        degree: n.
+        centres: of the blocks of size³ samples that one tetrahedron needs, in steps along the cone's axes from the
+            centre of the cell.
+        size: 2 or 3.
+        samples: which K samples of these, each as the number of its block and its place there, 0 … size − 1 along the
+            cone's axes.
+        masks: R different ones, of K weights each.
+        rows: for every shape, which of the masks its B Bernstein coefficients are.
+        barycentric: for every shape 4 rows (d, n), λ_k = d + n · x.
+    """
+
+    octahedral: bool
+    degree: int
+    centres: tuple[Steps, ...]
+    size: int
+    samples: tuple[tuple[int, Steps], ...]
+    masks: tuple[tuple[float, ...], ...]
+    rows: tuple[tuple[int, ...], ...]
+    barycentric: tuple[tuple[tuple[float, ...], ...], ...]
+
+    @cached_property
+    def steps(self) -> tuple[Steps, ...]:
+        """Where the samples lie along the cone's axes, from a cube's centre, from ½ before an octahedron's."""
+        return tuple(self._step(self.centres[block], place) for block, place in self.samples)
+
+    def _step(self, centre: Steps, place: Steps) -> Steps:
+        x, y, z = (c + p - self.before for c, p in zip(centre, place, strict=True))
+        return x, y, z
+
+    @property
+    def norm(self) -> float:
+        """No value is larger than this times the largest sample."""
+        return max(math.fsum(map(abs, mask)) for mask in self.masks)
+
+    @property
+    def before(self) -> int:
+        """By how much a block at the centre begins before the cell's own index, along every axis of space."""
+        return 0 if self.octahedral else self.size // 2
+
+    @cached_property
+    def reach(self) -> tuple[int, int]:
+        """Samples before and behind that of a cell's own index, along any axis of space."""
+        farthest = max(abs(step) for centre in self.centres for step in centre)
+        return farthest + self.before, farthest + self.size - 1 - self.before
+
+
+@dataclass(frozen=True)
+class TetrahedralStencil:
+    """Derivatives of a spline on tetrahedra that are computed together, as rows; a stencil like `ops.stencil.Stencil`.
+
+    Attributes:
+        spline: what is summed.
+        orders: of the derivatives, ascending; each has all of its rows, in the order of `multi_indices`.
+    """
+
+    spline: Tetrahedra
+    orders: tuple[int, ...]
+    exact = True
+
+    @property
+    def rows(self) -> tuple[MultiIndex, ...]:
+        """(m_x, m_y, m_z) of every row."""
+        return tuple(m for m in multi_indices(max(self.orders)) if sum(m) in self.orders)
+
+    @property
+    def order(self) -> int:
+        return max(self.orders)
+
+    @property
+    def supports(self) -> MultiIndex:
+        """S: from ⌊x − S/2 + 1⌋ on, along any axis, S samples have all that a point x needs, whatever its cell."""
+        size = 2 * math.ceil(max(self.spline.reach) + 0.5) if self.spline.octahedral else sum(self.spline.reach) + 1
+        return size, size, size
+
+    @cached_property
+    def derivatives(self) -> tuple[TetrahedralStencil, tuple[tuple[int, ...], ...]]:
+        """(stencil, raised): row raised[axis][r] of that one is the derivative along `axis` of row r of this one."""
+        raised = TetrahedralStencil(self.spline, tuple(order + 1 for order in self.orders))
+        numbers = {m: number for number, m in enumerate(raised.rows)}
+        return raised, tuple(tuple(numbers[raise_along(m, axis)] for m in self.rows) for axis in range(3))
+
+    def up_to(self, order: int) -> TetrahedralStencil:
+        """The rows of orders up to this one."""
+        return TetrahedralStencil(self.spline, tuple(own for own in self.orders if own <= order))
+
+    @property
+    def lowered(self) -> TetrahedralStencil:
+        """Itself: it is numbers already."""
+        return self
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash((self.spline, self.orders))
+
+
+AnyStencil = Stencil | TetrahedralStencil
+LoweredStencil = Lowered | TetrahedralStencil
+
+
+def _exchange(along: Steps, axes: tuple[int, int]) -> Steps:
+    own, (i, j) = list(along), axes
+    own[i], own[j] = own[j], own[i]
+    return own[0], own[1], own[2]
+
+
+def _mirror(at: Steps, axis: int, last: int) -> Steps:
+    x, y, z = (last - k if i == axis else k for i, k in enumerate(at))
+    return x, y, z
+
+
+def raise_along(m: MultiIndex, axis: int) -> MultiIndex:
+    x, y, z = (order + (i == axis) for i, order in enumerate(m))
+    return x, y, z
+
+
+@cache
+def _derivative_weights(slopes: tuple[tuple[float, ...], ...], degree: int, along: MultiIndex) -> dict[Index, float]:
+    """D^m s = n!/(n − r)! Σ_(k_1 … k_r) Π ∂_(i_j) λ_(k_j) · c_(e_k1 + … + e_kr), c of degree r = |m|: its weights."""
+    axes = [axis for axis, order in enumerate(along) for _ in range(order)]
+    weights: dict[Index, float] = {}
+    for vertices in product(range(4), repeat=len(axes)):
+        alpha = tuple(vertices.count(k) for k in range(4))
+        weights[alpha] = weights.get(alpha, 0.0) + math.prod(slopes[k][i] for k, i in zip(vertices, axes, strict=True))
+    return {alpha: math.perm(degree, len(axes)) * w for alpha, w in weights.items() if w}
+
+
+@cache
+def _steps(degree: int) -> tuple[tuple[int, ...], ...]:
+    """For every |β| = degree − 1 the numbers of β + e_0 … β + e_3 among those of the degree."""
+    numbers = {alpha: i for i, alpha in enumerate(bernstein_indices(degree, 3))}
+    raised = (
+        tuple(tuple(b + (i == k) for i, b in enumerate(beta)) for k in range(4))
+        for beta in bernstein_indices(degree - 1, 3)
+    )
+    return tuple(tuple(numbers[alpha] for alpha in row) for row in raised)
+
+
+@dataclass(frozen=True)
+class Turned:
+    """Points brought into the cone.
+
+    Attributes:
+        negative: masks along x, y, z: where u < 0.
+        exchanged: masks of `_EXCHANGES`.
+        shapes: masks of the shapes but the first; a point is in the last of those that hold for it, or in the first.
+        barycentric: λ_0 … λ_3.
+        nothing: 0, or NaN where the point is.
+    """
+
+    negative: list[Value]
+    exchanged: list[Value]
+    shapes: list[Value]
+    barycentric: list[Value]
+    nothing: Value
+
+
+class Sum:
+    """Writes the sums of a stencil.
+
+    Args:
+        arithmetic: what they are written in.
+        stencil: what is summed.
+    """
+
+    def __init__(self, arithmetic: Arithmetic, stencil: TetrahedralStencil) -> None:
+        self.arithmetic, self.stencil, self.spline = arithmetic, stencil, stencil.spline
+        x = range(self.spline.size)
+        self.places: list[Steps] = [(i, j, k) for k in x for j in x for i in x]
+
+    # --- where points are ---
+
+    def cells(self, points: Sequence[Value]) -> list[Value]:
+        """The index of the cell of every point, a whole number along each axis."""
+        e = self.arithmetic
+        if not self.spline.octahedral:
+            return [e.floor(e.add(x, e.constant(0.5))) for x in points]
+        y = [e.subtract(x, e.constant(0.5)) for x in points]
+        even = [self._doubled(e.floor(e.multiply_add(own, e.constant(0.5), e.constant(0.5)))) for own in y]
+        odd = [e.add(self._doubled(e.floor(e.multiply(own, e.constant(0.5)))), e.constant(1)) for own in y]
+        distance = None
+        for own, centre in zip(y, even, strict=True):
+            away = e.absolute(e.subtract(own, centre))
+            distance = away if distance is None else e.add(distance, away)
+        beyond = e.less(e.constant(1.5), distance)
+        return [e.where(beyond, b, a) for a, b in zip(even, odd, strict=True)]
+
+    def _doubled(self, a: Value) -> Value:
+        return self.arithmetic.add(a, a)
+
+    def local(self, point: Value, cell: Value) -> Value:
+        """u along an axis."""
+        e = self.arithmetic
+        u = e.subtract(point, cell)
+        return e.subtract(u, e.constant(0.5)) if self.spline.octahedral else u
+
+    def turn(self, u: Sequence[Value]) -> Turned:
+        e = self.arithmetic
+        nothing = None
+        for own in u:
+            nothing = e.multiply_add(own, e.constant(0), nothing)
+        negative, place, exchanged = [e.less(x, e.constant(0)) for x in u], [e.absolute(x) for x in u], []
+        for i, j in _EXCHANGES:
+            mask = e.less(place[i], place[j])
+            exchanged.append(mask)
+            place[i], place[j] = e.where(mask, place[j], place[i]), e.where(mask, place[i], place[j])
+        every = [[self._affine(row, place) for row in shape] for shape in self.spline.barycentric]
+        shapes, barycentric = self._chosen(every)
+        return Turned(negative, exchanged, shapes, barycentric, nothing)
+
+    def _affine(self, row: Sequence[float], place: Sequence[Value]) -> Value:
+        e, total = self.arithmetic, None
+        for slope, x in zip(row[1:], place, strict=True):
+            if slope:
+                total = e.multiply_add(x, e.constant(slope), e.constant(row[0]) if total is None else total)
+        return total
+
+    def _chosen(self, every: list[list[Value]]) -> tuple[list[Value], list[Value]]:
+        """Of every shape's λ: masks of the shapes but the first, and the λ of the one with the largest least λ."""
+        e, (barycentric, *others) = self.arithmetic, every
+        least, better = self._least(barycentric), []
+        for other in others:
+            own = self._least(other)
+            mask = e.less(least, own)
+            least = e.where(mask, own, least)
+            barycentric = [e.where(mask, b, a) for a, b in zip(barycentric, other, strict=True)]
+            better.append(mask)
+        return better, barycentric
+
+    def _least(self, numbers: Sequence[Value]) -> Value:
+        e, (least, *others) = self.arithmetic, numbers
+        for other in others:
+            least = e.where(e.less(other, least), other, least)
+        return least
+
+    def by_shape(self, turned: Turned, values: Sequence[Value]) -> Value:
+        """Of one value for every shape that of the point's own; values that are the same thing are chosen once."""
+        chosen = values[0]
+        for mask, value in zip(turned.shapes, values[1:], strict=True):
+            chosen = chosen if value is chosen else self.arithmetic.where(mask, value, chosen)
+        return chosen
+
+    def along_cone(self, turned: Turned, space: Sequence[Value]) -> list[Value]:
+        """What belongs to the axes of space, in the order of the cone's."""
+        along, e = list(space), self.arithmetic
+        for mask, (i, j) in zip(turned.exchanged, _EXCHANGES, strict=True):
+            along[i], along[j] = e.where(mask, along[j], along[i]), e.where(mask, along[i], along[j])
+        return along
+
+    # --- between the axes of the cone and those of space: what is known by three numbers, one for each axis ---
+
+    def _sorted(self, rows: Rows, turned: Turned) -> Rows:
+        """By axes of space, the signs settled: by axes of the cone."""
+        for mask, axes in zip(turned.exchanged, _EXCHANGES, strict=True):
+            rows = self._exchanged(rows, mask, axes)
+        return rows
+
+    def _unsorted(self, rows: Rows, turned: Turned) -> Rows:
+        """The inverse."""
+        for mask, axes in zip(reversed(turned.exchanged), reversed(_EXCHANGES), strict=True):
+            rows = self._exchanged(rows, mask, axes)
+        return rows
+
+    def _exchanged(self, rows: Rows, mask: Value, axes: tuple[int, int]) -> Rows:
+        return {m: self._either(mask, rows, _exchange(m, axes), m) for m in rows}
+
+    def _mirrored(self, block: Block, turned: Turned) -> Block:
+        """Turned round along the axes of space along which u is negative; its own inverse."""
+        last = self.spline.size - 1
+        for axis, negative in enumerate(turned.negative):
+            block = {at: self._either(negative, block, _mirror(at, axis, last), at) for at in block}
+        return block
+
+    def _either(self, mask: Value, values: Mapping[Steps, Value], a: Steps, b: Steps) -> Value:
+        """Of a where the mask holds, else of b; None where there is neither."""
+        e, first, second = self.arithmetic, values[a], values[b]
+        if first is second:
+            return second
+        first, second = (e.constant(0) if own is None else own for own in (first, second))
+        return e.where(mask, first, second)
+
+    def _signed(self, rows: Rows, turned: Turned) -> Rows:
+        return {m: self._with_signs(row, m, turned) for m, row in rows.items()}
+
+    def _with_signs(self, row: Value, m: MultiIndex, turned: Turned) -> Value:
+        for axis, order in enumerate(m):
+            if order % 2:
+                row = self.arithmetic.where(turned.negative[axis], self.arithmetic.negate(row), row)
+        return row
+
+    # --- the sums ---
+
+    def contract(self, blocks: Sequence[Block], turned: Turned) -> list[Value]:
+        """The rows of the stencil, from blocks of samples along the axes of space."""
+        along = [self._sorted(self._mirrored(block, turned), turned) for block in blocks]
+        return self.contract_samples([along[block][at] for block, at in self.spline.samples], turned)
+
+    def contract_samples(self, samples: Sequence[Value], turned: Turned) -> list[Value]:
+        """The same, from the K samples that the tetrahedron of each point needs."""
+        e, rows = self.arithmetic, {}
+        masks = [self._weighted(mask, samples) for mask in self.spline.masks]
+        pieces = [self.by_shape(turned, [masks[r] for r in own]) for own in zip(*self.spline.rows, strict=True)]
+        for order in range(self.spline.degree, -1, -1):
+            if order < self.spline.degree:
+                pieces = [self._step(pieces, row, turned.barycentric) for row in _steps(order + 1)]
+            if order in self.stencil.orders:
+                rows |= {m: self._derivative(pieces, m, turned) for m in self.stencil.rows if sum(m) == order}
+        found = self._signed(self._unsorted(rows, turned), turned)
+        return [e.add(found[m], turned.nothing) if m in found else turned.nothing for m in self.stencil.rows]
+
+    def _weighted(self, weights: Sequence[float], values: Sequence[Value]) -> Value:
+        """Σ weight · value; None where there is no weight."""
+        e, total = self.arithmetic, None
+        for weight, value in zip(weights, values, strict=True):
+            if weight and value is not None:
+                total = e.multiply_add(value, e.constant(weight), total)
+        return total
+
+    def _step(self, pieces: Sequence[Value], numbers: Sequence[int], barycentric: Sequence[Value]) -> Value:
+        total = None
+        for number, weight in zip(numbers, barycentric, strict=True):
+            total = self.arithmetic.multiply_add(weight, pieces[number], total)
+        return total
+
+    def _derivative(self, pieces: Sequence[Value], m: MultiIndex, turned: Turned) -> Value:
+        if sum(m) == 0:
+            return pieces[0]
+        every = [self._weighted(row, pieces) for row in self._derivatives(m)]
+        return self.by_shape(turned, [self.arithmetic.constant(0) if own is None else own for own in every])
+
+    def _derivatives(self, m: MultiIndex) -> list[list[float]]:
+        """For every shape the weights of the coefficients of degree |m|."""
+        indices, degree = bernstein_indices(sum(m), 3), self.spline.degree
+        slopes = [tuple(row[1:] for row in shape) for shape in self.spline.barycentric]
+        found = [_derivative_weights(own, degree, m) for own in slopes]
+        return [[weights.get(alpha, 0.0) for alpha in indices] for weights in found]
+
+    def spread(self, cotangents: Sequence[Value], turned: Turned) -> list[Block]:
+        """The transpose of `contract`: what is added to blocks of samples; None where that is nothing."""
+        along: list[Block] = [dict.fromkeys(self.places) for _ in self.spline.centres]  # type: ignore[misc]
+        for (block, at), value in zip(self.spline.samples, self.spread_samples(cotangents, turned), strict=True):
+            along[block][at] = value
+        return [self._mirrored(self._unsorted(block, turned), turned) for block in along]
+
+    def spread_samples(self, cotangents: Sequence[Value], turned: Turned) -> list[Value]:
+        """The same for the K samples that the tetrahedron of each point needs."""
+        degree = self.spline.degree
+        given = {m: own for m, own in zip(self.stencil.rows, cotangents, strict=True) if sum(m) <= degree}
+        rows = self._sorted(self._signed(given, turned), turned)
+        pieces: list[Value] = [None]
+        for order in range(degree + 1):
+            if order:
+                pieces = self._step_back(pieces, order, turned.barycentric)
+            for m, row in rows.items():
+                if sum(m) == order:
+                    self._derivative_back(pieces, row, m, turned)
+        masks: list[Value] = [None] * len(self.spline.masks)
+        for piece, own in zip(pieces, zip(*self.spline.rows, strict=True), strict=True):
+            if piece is not None:
+                for r, part in self._to_shapes(piece, own, turned):
+                    self._add(masks, r, part)
+        return [self._weighted(column, masks) for column in zip(*self.spline.masks, strict=True)]
+
+    def _add(self, sums: list[Value], place: int, value: Value) -> None:
+        sums[place] = value if sums[place] is None else self.arithmetic.add(sums[place], value)
+
+    def _step_back(self, pieces: Sequence[Value], degree: int, barycentric: Sequence[Value]) -> list[Value]:
+        raised: list[Value] = [None] * len(bernstein_indices(degree, 3))
+        for piece, numbers in zip(pieces, _steps(degree), strict=True):
+            if piece is not None:
+                for number, weight in zip(numbers, barycentric, strict=True):
+                    raised[number] = self.arithmetic.multiply_add(weight, piece, raised[number])
+        return raised
+
+    def _derivative_back(self, pieces: list[Value], row: Value, m: MultiIndex, turned: Turned) -> None:
+        e = self.arithmetic
+        if sum(m) == 0:
+            return self._add(pieces, 0, row)
+        every = self._derivatives(m)
+        for shape, part in self._to_shapes(row, range(len(every)), turned):
+            for place, weight in enumerate(every[shape]):
+                if weight:
+                    pieces[place] = e.multiply_add(part, e.constant(weight), pieces[place])
+        return None
+
+    def _to_shapes(self, value: Value, own: Sequence[int], turned: Turned) -> list[tuple[int, Value]]:
+        """The transpose of `by_shape`, of shapes that are these numbers: the value for its own, 0 for the others."""
+        e, parts, left = self.arithmetic, [], value
+        if len(set(own)) == 1:
+            return [(own[0], value)]
+        for mask, number in zip(reversed(turned.shapes), reversed(own[1:]), strict=True):
+            parts.append((number, e.where(mask, left, e.constant(0))))
+            left = e.where(mask, e.constant(0), left)
+        return [*parts, (own[0], left)]
