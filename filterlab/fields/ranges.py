@@ -20,6 +20,7 @@ from filterlab.ops.differentiable.bounds import bounds
 from filterlab.ops.pieces import Lattice
 from filterlab.ops.raycast import marks_of
 from filterlab.ops.reference.bounds import layers_of, weights_of
+from filterlab.ops.tetrahedra import AnyLattice, TetrahedralLattice
 
 _MANY = 1 << 25  # cells from which on bricks have edges of 4, not 2
 _ROUNDING = 64  # units of rounding that a sum of taps may lose, relative to Σ |w| · max |c|
@@ -73,7 +74,7 @@ _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 """Of coefficients that are still alive: {what was asked of them: (their version, ranges)}."""
 
 
-def edge_for(lattice: Lattice) -> int:
+def edge_for(lattice: AnyLattice) -> int:
     """Cells along an edge of a brick: bounds take 4 bytes a cell, or, of large volumes, ½.
 
     Measured (Marschner-Lobb 128³, trilinear to tricubic): with edges of 2 rays take 0.98 to 0.88 of the time that they
@@ -82,7 +83,7 @@ def edge_for(lattice: Lattice) -> int:
     return 2 if math.prod(lattice.cells) < _MANY else 4
 
 
-def ranges(lattice: Lattice, edge: int | None = None) -> Ranges:
+def ranges(lattice: AnyLattice, edge: int | None = None) -> Ranges:
     """Bounds of every brick; kept for as long as the coefficients are, and made anew after they were written to.
 
     Made anew every time for kernels that are tensors: these may change too.
@@ -92,7 +93,7 @@ def ranges(lattice: Lattice, edge: int | None = None) -> Ranges:
         return _made(lattice, edge)
     base = lattice.coefficients._base
     owner = lattice.coefficients if base is None else base
-    asked = (grid.storage_offset(), grid.shape, grid.stride(), lattice.row, lattice.scale, lattice.shift, edge)
+    asked = (grid.storage_offset(), grid.shape, grid.stride(), lattice.stencil, lattice.scale, lattice.shift, edge)
     kept: dict = _known.setdefault(owner, {})  # type: ignore[assignment]
     version, found = kept.get(asked, (None, None))
     if found is None or version != grid._version:
@@ -101,7 +102,7 @@ def ranges(lattice: Lattice, edge: int | None = None) -> Ranges:
     return found
 
 
-def _made(lattice: Lattice, edge: int) -> Ranges:
+def _made(lattice: AnyLattice, edge: int) -> Ranges:
     least, most = _ends(lattice.coefficients.detach())
     codes = Codes.of(lattice, least, most)
     low, high, ends = bounds(lattice, edge // 2, codes)
@@ -118,8 +119,10 @@ def _ends(c: Tensor) -> tuple[float, float]:
     return least, most
 
 
-def _norm(lattice: Lattice) -> float:
+def _norm(lattice: AnyLattice) -> float:
     """At least Σ |w|, anywhere in a cell."""
+    if isinstance(lattice, TetrahedralLattice):
+        return lattice.spline.norm
     total = 0.0
     for product in lattice.row:
         size = abs(product.weight)

@@ -186,7 +186,22 @@ class Spline:
             masks=tuple(masks),
             rows=tuple(rows),
             barycentric=tuple(tuple(tuple(map(float, row)) for row in s.barycentric) for s in self.shapes),
+            cuts=tuple((normal, float(d)) for normal, d in sorted(self._cuts())),
         )
+
+    def _cuts(self) -> set[tuple[Normal, Fraction]]:
+        """The planes of faces within the cube about the sample 0, in which no tetrahedron lies partly."""
+        half, found = Fraction(1, 2), set()
+        for (number, turn), shift in product(self.tetrahedra, {self.shift, -self.shift}):
+            shape = self.shapes[number]
+            if all(abs(c + shift) <= half for v in shape.vertices for c in turn(v)):
+                for row in shape.barycentric:
+                    normal, d = primitive(row)
+                    normal = turn(normal)
+                    plane = upright(normal, sum(normal) * shift - d)
+                    if sum(map(abs, normal)) > 1 or abs(plane[1]) < half:
+                        found.add(plane)
+        return found
 
     def _place_in_blocks(self, sample: Vector) -> tuple[int, tuple[int, int, int]]:
         """The block that a sample is in, the first one, and its place there."""
@@ -196,6 +211,23 @@ class Spline:
             if all(0 <= place <= 2 * half for place in (x, y, z)):
                 return number, (int(x), int(y), int(z))
         raise ValueError(f"{self.name}: no block of samples has the one at {tuple(map(str, sample))}")
+
+
+Normal = tuple[int, int, int]
+
+
+def primitive(row: tuple[Fraction, ...]) -> tuple[Normal, Fraction]:
+    """(n, d) of d + n · x, with integers n that have no factor in common."""
+    d, *slopes = row
+    factor = Fraction(math.lcm(*(s.denominator for s in slopes)), math.gcd(*(s.numerator for s in slopes)))
+    x, y, z = (int(factor * s) for s in slopes)
+    return (x, y, z), factor * d
+
+
+def upright(normal: Normal, d: Fraction) -> tuple[Normal, Fraction]:
+    """The same plane n · x = d, of both normals the greater."""
+    x, y, z = normal
+    return max((normal, d), ((-x, -y, -z), -d), key=lambda plane: plane[0])
 
 
 # --- the spline in numbers --------------------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ Source: Kalbe and Zeilfelder 2008, section 5, and the walk through planes instea
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -24,13 +23,26 @@ from torch import Tensor
 from filterlab import bernstein
 from filterlab.fields.base import Field, Relevant, type_of_rays
 from filterlab.fields.grid import GridField
-from filterlab.fields.tetrahedral import TURNS, JetOnTetrahedra, Located, OnTetrahedra, Spline, Turn, locate
+from filterlab.fields.tetrahedral import (
+    TURNS,
+    JetOnTetrahedra,
+    Located,
+    Normal,
+    OnTetrahedra,
+    Spline,
+    Turn,
+    locate,
+    primitive,
+    upright,
+)
+from filterlab.ops.differentiable import raycast as casting
 from filterlab.ops.pieces import Pieces
+from filterlab.ops.raycast import Candidates, Raycast
 from filterlab.ops.reference.pieces import CHUNK, Lines, inside, joined
+from filterlab.ops.tetrahedra import TetrahedralLattice
 
 _ROUNDING = 64  # units of rounding, relative to the largest value, by which bounds of a cell are widened
 
-Normal = tuple[int, int, int]
 Bounds = tuple[Tensor, Tensor, int]
 """The least and the greatest sample that each cell needs, (D, H, W) float64, and the first cell along every axis."""
 
@@ -52,26 +64,12 @@ class Planes:
     def of(cls, spline: Spline) -> Planes:
         outer, inner = set(), set()
         for shape in spline.shapes:
-            (apex, *sides) = (_primitive(row) for row in shape.barycentric)
+            (apex, *sides) = (primitive(row) for row in shape.barycentric)
             for turn in TURNS:
-                normal, d = _upright(turn(apex[0]), -apex[1])
+                normal, d = upright(turn(apex[0]), -apex[1])
                 outer.add((normal, float((sum(normal) * spline.shift + d) % 1)))
-                inner.update(_upright(turn(normal), Fraction(0))[0] for normal, _ in sides)
+                inner.update(upright(turn(normal), Fraction(0))[0] for normal, _ in sides)
         return cls(tuple(sorted(outer)), tuple(sorted(inner)))
-
-
-def _primitive(row: tuple[Fraction, ...]) -> tuple[Normal, Fraction]:
-    """(n, d) of d + n · x, with integers n that have no factor in common."""
-    d, *slopes = row
-    factor = Fraction(math.lcm(*(s.denominator for s in slopes)), math.gcd(*(s.numerator for s in slopes)))
-    x, y, z = (int(factor * s) for s in slopes)
-    return (x, y, z), factor * d
-
-
-def _upright(normal: Normal, d: Fraction) -> tuple[Normal, Fraction]:
-    """The same plane n · x = d, of both normals the greater."""
-    x, y, z = normal
-    return max((normal, d), ((-x, -y, -z), -d), key=lambda plane: plane[0])
 
 
 class FieldOnTetrahedra(GridField):
@@ -92,9 +90,36 @@ class FieldOnTetrahedra(GridField):
     def degree_along_rays(self) -> int | None:
         return self.scheme.spline.degree if self.channels is None else None
 
-    # what programs cast, plain torch casts here
-    first_crossing = Field.first_crossing
-    crossing_candidates = Field.crossing_candidates
+    @property
+    def lattice(self) -> TetrahedralLattice:
+        """The cubes about the samples; of an unbatched field, padded for programs."""
+        spline, values = self.scheme.spline.lowered, self.coefficients.values
+        for dim, n in zip((-1, -2, -3), self.coefficients.size, strict=True):
+            values = values.narrow(dim, -self.coefficients.start - spline.around, n + 2 * spline.around)
+        x, y, z = (float(n) for n in self.coefficients.size)
+        quantization = self.coefficients.quantization
+        scale, shift = (1.0, 0.0) if quantization is None else quantization.numbers()
+        return TetrahedralLattice(values, spline, (-0.5, -0.5, -0.5), (0.0, 0.0, 0.0), (x, y, z), scale, shift)
+
+    def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
+        given = self._program(level, origins, directions)
+        if given is None:
+            return Field.first_crossing(self, origins, directions, level)
+        return casting.first(given, origins, directions)
+
+    def crossing_candidates(self, origins: Tensor, directions: Tensor, level: float) -> Candidates:
+        given = self._program(level, origins, directions)
+        if given is None:
+            return Field.crossing_candidates(self, origins, directions, level)
+        return casting.candidates(given, origins, directions)
+
+    def _program(self, level: float, origins: Tensor, directions: Tensor) -> Raycast | None:
+        """What a program casts; None where none can run, or plain torch is how this field is evaluated."""
+        self._check_pieces()
+        if self.scheme.name == "direct":
+            return None
+        given = self._raycast(level, origins, directions)
+        return given if casting.missing(given, origins) is None else None
 
     def _most_pieces(self) -> int:
         return super()._most_pieces() * (len(Planes.of(self.scheme.spline).inner) + 1)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from filterlab.ops.pieces import Lattice
+from filterlab.ops.tetrahedra import AnyLattice
 
 CODES = 1 << 16
 _USUAL = (0.0005, 0.9995)  # quantiles of coefficients that are told apart
@@ -49,7 +49,7 @@ class Codes:
     step: float
 
     @classmethod
-    def of(cls, lattice: Lattice, least: float, most: float) -> Codes:
+    def of(cls, lattice: AnyLattice, least: float, most: float) -> Codes:
         """For values of a lattice whose finite coefficients lie between `least` and `most`."""
         c = lattice.coefficients.detach()
         some = c[tuple(slice(None, None, max(1, n // _ASKED)) for n in c.shape)].double()

@@ -16,7 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from filterlab.ops.pieces import Lattice, along_ray
+from filterlab.ops.pieces import along_ray
+from filterlab.ops.tetrahedra import AnyLattice
 from filterlab.volume import Geometry
 
 JUMP, REPEATED = 1, 2  # bits of `Written.flags`
@@ -126,7 +127,7 @@ class Raycast:
         edge: cells along an edge of a brick, a power of two from 2 on.
     """
 
-    lattice: Lattice
+    lattice: AnyLattice
     geometry: Geometry
     level: float
     dtype: torch.dtype

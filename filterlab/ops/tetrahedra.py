@@ -19,8 +19,11 @@ from functools import cache, cached_property
 from itertools import product
 from typing import Any, Protocol
 
+from torch import Tensor
+
 from filterlab.bernstein import Index
 from filterlab.bernstein import multi_indices as bernstein_indices
+from filterlab.ops.pieces import Lattice, Triple
 from filterlab.ops.stencil import Lowered, MultiIndex, Stencil, multi_indices
 
 Value = Any
@@ -68,6 +71,8 @@ class Tetrahedra:
         masks: R different ones, of K weights each.
         rows: for every shape, which of the masks its B Bernstein coefficients are.
         barycentric: for every shape 4 rows (d, n), λ_k = d + n · x.
+        cuts: planes (n, d), n · v = d, that cut the cube |v| ≤ ½ about a sample into parts of one tetrahedron each; of
+            octahedra about a sample at even indices, v turned round along the axes of odd ones.
     """
 
     octahedral: bool
@@ -78,6 +83,7 @@ class Tetrahedra:
     masks: tuple[tuple[float, ...], ...]
     rows: tuple[tuple[int, ...], ...]
     barycentric: tuple[tuple[tuple[float, ...], ...], ...]
+    cuts: tuple[tuple[Steps, float], ...]
 
     @cached_property
     def steps(self) -> tuple[Steps, ...]:
@@ -92,6 +98,11 @@ class Tetrahedra:
     def norm(self) -> float:
         """No value is larger than this times the largest sample."""
         return max(math.fsum(map(abs, mask)) for mask in self.masks)
+
+    @property
+    def around(self) -> int:
+        """Samples before and behind the one in the middle of a cube that its tetrahedra need, along any axis."""
+        return 2 if self.octahedral else 1
 
     @property
     def before(self) -> int:
@@ -157,8 +168,52 @@ class TetrahedralStencil:
         return hash((self.spline, self.orders))
 
 
+@dataclass(frozen=True)
+class TetrahedralLattice:
+    """Cubes |x − i| ≤ ½ about the samples i of a domain, on parts of which a spline is one polynomial; see `Lattice`.
+
+    Attributes:
+        coefficients: (D, H, W), any real type: the samples that all cubes need, and no more.
+        spline: what is summed.
+        offset, lower, upper, scale, shift: as of a `Lattice`; offset is −½ along every axis.
+    """
+
+    coefficients: Tensor
+    spline: Tetrahedra
+    offset: Triple
+    lower: Triple
+    upper: Triple
+    scale: float = 1.0
+    shift: float = 0.0
+    exact = True
+    continuous = True
+
+    @cached_property
+    def stencil(self) -> TetrahedralStencil:
+        """Its value."""
+        return TetrahedralStencil(self.spline, (0,))
+
+    @property
+    def supports(self) -> MultiIndex:
+        """Samples along x, y, z that a cube needs, the same number before and behind its own."""
+        size = 2 * self.spline.around + 1
+        return size, size, size
+
+    @property
+    def degree(self) -> int:
+        """n, along a ray."""
+        return self.spline.degree
+
+    @property
+    def cells(self) -> MultiIndex:
+        """Cubes along x, y, z."""
+        x, y, z = (n - s + 1 for n, s in zip(self.coefficients.shape[::-1], self.supports, strict=True))
+        return x, y, z
+
+
 AnyStencil = Stencil | TetrahedralStencil
 LoweredStencil = Lowered | TetrahedralStencil
+AnyLattice = Lattice | TetrahedralLattice
 
 
 def _exchange(along: Steps, axes: tuple[int, int]) -> Steps:
@@ -201,7 +256,7 @@ def _steps(degree: int) -> tuple[tuple[int, ...], ...]:
 
 @dataclass(frozen=True)
 class Turned:
-    """Points brought into the cone.
+    """Points brought into the cone, and how.
 
     Attributes:
         negative: masks along x, y, z: where u < 0.
@@ -257,19 +312,34 @@ class Sum:
         u = e.subtract(point, cell)
         return e.subtract(u, e.constant(0.5)) if self.spline.octahedral else u
 
-    def turn(self, u: Sequence[Value]) -> Turned:
+    def turn(self, u: Sequence[Value], negative: Sequence[Value] | None = None) -> Turned:
+        """Bring points into the cone.
+
+        Args:
+            u: along x, y, z.
+            negative: which sides they belong to, also those with u = 0; None: it does not matter.
+        """
         e = self.arithmetic
         nothing = None
         for own in u:
             nothing = e.multiply_add(own, e.constant(0), nothing)
-        negative, place, exchanged = [e.less(x, e.constant(0)) for x in u], [e.absolute(x) for x in u], []
+        sides = [e.less(x, e.constant(0)) for x in u] if negative is None else list(negative)
+        place, exchanged = [e.where(side, e.negate(x), x) for side, x in zip(sides, u, strict=True)], []
         for i, j in _EXCHANGES:
             mask = e.less(place[i], place[j])
             exchanged.append(mask)
             place[i], place[j] = e.where(mask, place[j], place[i]), e.where(mask, place[i], place[j])
         every = [[self._affine(row, place) for row in shape] for shape in self.spline.barycentric]
         shapes, barycentric = self._chosen(every)
-        return Turned(negative, exchanged, shapes, barycentric, nothing)
+        return Turned(sides, exchanged, shapes, barycentric, nothing)
+
+    def barycentric(self, turned: Turned, u: Sequence[Value]) -> list[Value]:
+        """λ of other points, in the tetrahedra of those that were turned."""
+        e = self.arithmetic
+        signed = [e.where(negative, e.negate(x), x) for negative, x in zip(turned.negative, u, strict=True)]
+        place = self.along_cone(turned, signed)
+        every = [[self._affine(row, place) for row in shape] for shape in self.spline.barycentric]
+        return [self.by_shape(turned, own) for own in zip(*every, strict=True)]
 
     def _affine(self, row: Sequence[float], place: Sequence[Value]) -> Value:
         e, total = self.arithmetic, None
@@ -355,14 +425,45 @@ class Sum:
 
     def contract(self, blocks: Sequence[Block], turned: Turned) -> list[Value]:
         """The rows of the stencil, from blocks of samples along the axes of space."""
+        return self.contract_samples(self._samples(blocks, turned), turned)
+
+    def _samples(self, blocks: Sequence[Block], turned: Turned) -> list[Value]:
         along = [self._sorted(self._mirrored(block, turned), turned) for block in blocks]
-        return self.contract_samples([along[block][at] for block, at in self.spline.samples], turned)
+        return [along[block][at] for block, at in self.spline.samples]
+
+    def _coefficients(self, samples: Sequence[Value], turned: Turned) -> list[Value]:
+        masks = [self._weighted(mask, samples) for mask in self.spline.masks]
+        return [self.by_shape(turned, [masks[r] for r in own]) for own in zip(*self.spline.rows, strict=True)]
+
+    def restrict(
+        self, blocks: Sequence[Block], turned: Turned, start: Sequence[Value], end: Sequence[Value]
+    ) -> list[Value]:
+        """The n + 1 Bernstein coefficients of the value between two points, λ in the tetrahedra of those turned."""
+        return self._restricted(self._coefficients(self._samples(blocks, turned), turned), start, end)
+
+    def restrict_samples(
+        self, samples: Sequence[Value], turned: Turned, start: Sequence[Value], end: Sequence[Value]
+    ) -> list[Value]:
+        """The same, from the K samples that the tetrahedron of each point needs."""
+        return self._restricted(self._coefficients(samples, turned), start, end)
+
+    def _restricted(self, pieces: list[Value], start: Sequence[Value], end: Sequence[Value]) -> list[Value]:
+        """The blossom n − j times at the start and j times at the end, for j = 0 … n."""
+        degree = self.spline.degree
+        found = {(0, 0): pieces}
+
+        def blossom(a: int, b: int) -> list[Value]:
+            if (a, b) not in found:  # of both the one that is asked more often comes first: fewer are needed
+                at_end = a == 0 or 0 < b <= a
+                before, weights = (blossom(a, b - 1), end) if at_end else (blossom(a - 1, b), start)
+                found[a, b] = [self._step(before, row, weights) for row in _steps(degree - a - b + 1)]
+            return found[a, b]
+
+        return [blossom(degree - j, j)[0] for j in range(degree + 1)]
 
     def contract_samples(self, samples: Sequence[Value], turned: Turned) -> list[Value]:
         """The same, from the K samples that the tetrahedron of each point needs."""
-        e, rows = self.arithmetic, {}
-        masks = [self._weighted(mask, samples) for mask in self.spline.masks]
-        pieces = [self.by_shape(turned, [masks[r] for r in own]) for own in zip(*self.spline.rows, strict=True)]
+        e, rows, pieces = self.arithmetic, {}, self._coefficients(samples, turned)
         for order in range(self.spline.degree, -1, -1):
             if order < self.spline.degree:
                 pieces = [self._step(pieces, row, turned.barycentric) for row in _steps(order + 1)]

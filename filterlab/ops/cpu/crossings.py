@@ -18,7 +18,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import comb
 
 from llvmlite import ir
 
@@ -27,10 +26,11 @@ from filterlab.ops.cpu.cells import Found, Walk
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, I8, I32, I64, STORAGE, Lanes, Value
 from filterlab.ops.cpu.polynomials import FirstRoot, Part, Rows
-from filterlab.ops.cpu.restriction import Restriction
+from filterlab.ops.cpu.restriction import Restriction, Section
 from filterlab.ops.cpu.taps import Grid
+from filterlab.ops.cpu.tetrahedral_restriction import TetrahedralRestriction
 from filterlab.ops.raycast import JUMP, REPEATED
-from filterlab.ops.stencil import Lowered
+from filterlab.ops.tetrahedra import LoweredStencil, TetrahedralStencil
 
 PACKS_OF_A_CHUNK = 16
 
@@ -87,7 +87,7 @@ class RaycastVariant:
     """
 
     asked: str
-    stencil: Lowered
+    stencil: LoweredStencil
     degree: int
     continuous: bool
     arithmetic: str
@@ -136,7 +136,7 @@ class _Program:
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         no_ends = DOUBLE(0.0), DOUBLE(0.0), DOUBLE(0.0)
         grid = Grid(j.width, j.height, I64(0), no_ends, no_ends)
-        self.restriction = Restriction(e, v.stencil, v.degree, self.storage, grid, v.room)
+        self.restriction = self._restriction_of(v.stencil, grid)
         self.search = FirstRoot(e, v.degree)
         self.walk = Walk(self.places, j)
         self._ended_at = self.places.variable(self.places.constant(-1))
@@ -147,6 +147,12 @@ class _Program:
             with e.repeat(first, e.smaller(b.add(first, I64(PACKS_OF_A_CHUNK)), j.packs)) as pack:
                 self._cast(self._rays_of(pack))
         b.ret_void()
+
+    def _restriction_of(self, stencil: LoweredStencil, grid: Grid) -> Restriction | TetrahedralRestriction:
+        e, v = self.lanes, self.variant
+        if isinstance(stencil, TetrahedralStencil):
+            return TetrahedralRestriction(e, stencil, self.storage, grid, v.room)
+        return Restriction(e, stencil, v.degree, self.storage, grid, v.room)
 
     def _rays_of(self, pack: Value) -> list[Value]:
         """The numbers of a pack's rays; beyond the last row or column that one's again, which ends as it does."""
@@ -191,7 +197,10 @@ class _Program:
         with e.repeat_while(going):
             found = walk.next_cells(self.waiting())
             with b.if_then(e.any(found.mask)):
-                self.take(rays, self._piece(found))
+                start, end = (self._within(found.cell, s) for s in (found.near, found.far))
+                place = self._taps(found.cell), found.cell, start, end, found.mask, self.waiting
+                with self.restriction.every(*place) as section:
+                    self.take(rays, self._piece(found, section))
         self.finish(rays)
 
     def _vectors(self, array: Value, rays: Sequence[Value]) -> list[Value]:
@@ -208,14 +217,11 @@ class _Program:
 
     # --- pieces ---
 
-    def _piece(self, found: Found) -> Piece:
+    def _piece(self, found: Found, section: Section) -> Piece:
         e, b, p, v = self.lanes, self.builder, self.places, self.variant
-        start, end = (self._within(found.cell, s) for s in (found.near, found.far))
-        total = self.restriction.restrict(self._taps(found.cell), start, end)
+        found = self._of_section(found, section)
         scale, shift = (e.everywhere(e.scalar(x)) for x in (self.job.scale, self.job.shift))
-        rows = [
-            e.multiply_add(e.multiply(c, e.constant(1 / comb(v.degree, i))), scale, shift) for i, c in enumerate(total)
-        ]
+        rows = [e.multiply_add(c, scale, shift) for c in section.rows]
         sum_ = rows[0]
         for r in rows[1:]:
             sum_ = e.add(sum_, r)
@@ -228,6 +234,20 @@ class _Program:
         self._ended_at.value = p.where(found.mask, found.far, self._ended_at.value)
         self._ended_with.value = e.where(found.mask, rows[-1], before)
         return Piece(found, rows, whole, joined, before)
+
+    def _of_section(self, found: Found, section: Section) -> Found:
+        near, far = self._along(found, section.start, found.near), self._along(found, section.end, found.far)
+        return Found(section.mask, found.cell, near, far)
+
+    def _along(self, found: Found, part: Value | None, if_all: Value) -> Value:
+        """Where so much of a ray's part in a cell is behind; its ends to the bit."""
+        if part is None:
+            return if_all
+        p, b = self.places, self.builder
+        part = part if self.number == DOUBLE else b.fpext(part, p.pack)
+        between = p.multiply_add(part, p.subtract(found.far, found.near), found.near)
+        behind = p.where(p.less(part, p.constant(1)), between, found.far)
+        return p.where(p.less(p.constant(0), part), behind, found.near)
 
     def _within(self, cell: Sequence[Value], s: Value) -> list[Value]:
         """Where rays are in their cells at s, in [0, 1]."""

@@ -11,7 +11,9 @@ out is f at u₀ and u₁ to a rounding or two, with no cancellation but that of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from math import comb
 
 from filterlab.ops.cpu.lanes import I64, Lanes, Storage, Value
@@ -25,6 +27,22 @@ Weights = list[list[list[Polynomial | None]]]
 """[axis][function][t]: the weight of tap t; None where the function has none."""
 
 
+@dataclass(frozen=True)
+class Section:
+    """A section of a ray's part in a cell.
+
+    Attributes:
+        mask: which lanes have one.
+        start, end: packs in [0, 1], of the part's length; None: all of it.
+        rows: n + 1 Bernstein coefficients.
+    """
+
+    mask: Value
+    start: Value | None
+    end: Value | None
+    rows: list[Value]
+
+
 class Restriction(Taps):
     """Writes restrictions of a stencil of one row to polynomials of a degree. Make it before any loop."""
 
@@ -36,6 +54,29 @@ class Restriction(Taps):
         self._along_z = lanes.reserve(lanes.pack, self.supports[2] * len(self.degrees[2]) * self._numbers)
         with lanes.builder.goto_entry_block():
             self._total = [lanes.kept() for _ in range(self.degree + 1)]
+
+    @contextmanager
+    def every(
+        self,
+        taps: list[Value],
+        cell: Sequence[Value],
+        start: Sequence[Value],
+        end: Sequence[Value],
+        mask: Value,
+        waiting: Callable[[], Value],
+    ) -> Iterator[Section]:
+        """The with-block, for each of the sections in which a ray's part in a cell is one polynomial: the whole.
+
+        Args:
+            taps: address of every lane's first tap.
+            cell: its index along x, y, z, from the lattice's first one.
+            start, end: where the part begins and ends, packs of x, y, z in [0, 1].
+            mask: which lanes are asked for.
+            waiting: a mask of lanes that need not go on.
+        """
+        e = self.lanes
+        scaled = enumerate(self.restrict(taps, start, end))
+        yield Section(mask, None, None, [e.multiply(c, e.constant(1 / comb(self.degree, i))) for i, c in scaled])
 
     def restrict(self, taps: list[Value], start: Sequence[Value], end: Sequence[Value]) -> Polynomial:
         """Σ over taps between two places in their cells, degree + 1 scaled coefficients.

@@ -14,7 +14,7 @@ from llvmlite import ir
 
 from filterlab.ops.cpu.lanes import I32, I64, Lanes, Storage, Value
 from filterlab.ops.cpu.taps import Grid, Lines, Location
-from filterlab.ops.tetrahedra import Sum, TetrahedralStencil, Turned
+from filterlab.ops.tetrahedra import Block, Sum, TetrahedralStencil, Turned
 
 
 class CellLocation(Location):
@@ -40,17 +40,24 @@ class CellLocation(Location):
 
 
 @dataclass(frozen=True)
-class _Placed:
-    """Turned points, and where their blocks of samples begin.
+class Corners:
+    """Where blocks of samples begin, in coefficients.
 
     Attributes:
-        corners: for each block, from the coefficient of the cell's index, in coefficients; None: `same` for all.
-        same: of all blocks and points, in coefficients.
+        each: for each block what every lane adds (64 bits); None: nothing.
+        same: what all add.
     """
 
-    turned: Turned
-    corners: list[Value | None]
+    each: list[Value | None]
     same: Value
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """Turned points, and their blocks, from the coefficient of the cell's index."""
+
+    turned: Turned
+    corners: Corners
 
 
 class TetrahedralTaps:
@@ -69,18 +76,45 @@ class TetrahedralTaps:
         return CellLocation(lanes, self.stencil, self.storage, self.grid)
 
     def weigh(self, u: Sequence[Value]) -> _Placed:
-        e, b, spline = self.lanes, self.builder, self.sum.spline
-        turned = self.sum.turn(u)
+        spline, turned = self.sum.spline, self.sum.turn(u)
+        along = self.sum.along_cone(turned, self._signed_strides(turned))
+        corners = [self._moved(None, along, centre) for centre in spline.centres]
+        return _Placed(turned, Corners(corners, self._diagonal(-spline.before)))
+
+    def at_sample(self, turned: Turned | None) -> Corners:
+        """Of points in the cubes about samples, from the coefficient of the first sample that a cube needs.
+
+        Args:
+            turned: the points from the centres of their cells; None of cubes, which need the same samples everywhere.
+        """
+        spline = self.sum.spline
+        same = self._diagonal(spline.around - spline.before)
+        if turned is None:
+            return Corners([None] * len(spline.centres), same)
+        strides = self._signed_strides(turned)
+        none, first = ir.Constant(strides[0].type, None), None
+        for stride, negative in zip(strides, turned.negative, strict=True):  # the sample is ahead of the cell's centre
+            own = self.lanes.where(negative, none, stride)
+            first = self.builder.sub(none if first is None else first, own)
+        along = self.sum.along_cone(turned, strides)
+        return Corners([self._moved(first, along, centre) for centre in spline.centres], same)
+
+    def _signed_strides(self, turned: Turned) -> list[Value]:
+        """Along x, y, z away from the centre."""
+        e, b = self.lanes, self.builder
         plane = b.mul(self.grid.width, self.grid.height)
         strides = [e.everywhere(n) for n in (I64(1), self.grid.width, plane)]
         none = ir.Constant(strides[0].type, None)
-        signed = [e.where(negative, b.sub(none, s), s) for negative, s in zip(turned.negative, strides, strict=True)]
-        along = self.sum.along_cone(turned, signed)
-        same = b.mul(b.add(b.add(I64(1), self.grid.width), plane), I64(-spline.before))
-        return _Placed(turned, [self._moved(along, centre) for centre in spline.centres], same)
+        return [e.where(negative, b.sub(none, s), s) for negative, s in zip(turned.negative, strides, strict=True)]
 
-    def _moved(self, along: Sequence[Value], steps: Sequence[int]) -> Value | None:
-        b, total = self.builder, None
+    def _diagonal(self, steps: int) -> Value:
+        """So many steps along all three axes."""
+        b = self.builder
+        one = b.add(b.add(I64(1), self.grid.width), b.mul(self.grid.width, self.grid.height))
+        return b.mul(one, I64(steps))
+
+    def _moved(self, first: Value | None, along: Sequence[Value], steps: Sequence[int]) -> Value | None:
+        b, total = self.builder, first
         for row, step in zip(along, steps, strict=True):
             if step:
                 part = b.mul(row, ir.Constant(row.type, [step] * self.lanes.count))
@@ -102,19 +136,23 @@ class TetrahedralTaps:
 
     def contract(self, taps: list[Value], here: Value, weights: _Placed, u: Sequence[Value]) -> list[Value]:
         """The rows of the stencil; see `Taps.contract`."""
-        blocks, here = [], self.builder.add(here, weights.same)
-        for corner in weights.corners:
+        return self.sum.contract(self.blocks(taps, weights.corners, here), weights.turned)
+
+    def blocks(self, taps: list[Value], corners: Corners, here: Value) -> list[Block]:
+        """All that a tetrahedron needs, as it lies in memory."""
+        blocks, here = [], self.builder.add(here, corners.same)
+        for corner in corners.each:
             own, block = self._corners(taps, corner), {}
             for k, offset in enumerate(self._planes(here)):
                 for j, line in self.lines.fetch(own, offset, self._needed):
                     block |= {(i, j, k): tap for i, tap in line.items()}
             blocks.append(block)
-        return self.sum.contract(blocks, weights.turned)
+        return blocks
 
     def spread(self, taps: list[Value], here: Value, weights: _Placed, cotangents: list[Value]) -> None:
         """The transpose: add into the coefficients; see `Taps.spread`."""
-        e, here = self.lanes, self.builder.add(here, weights.same)
-        for corner, block in zip(weights.corners, self.sum.spread(cotangents, weights.turned), strict=True):
+        e, here = self.lanes, self.builder.add(here, weights.corners.same)
+        for corner, block in zip(weights.corners.each, self.sum.spread(cotangents, weights.turned), strict=True):
             own = self._corners(taps, corner)
             for k, offset in enumerate(self._planes(here)):
                 lines = {j: [block[i, j, k] for i in needed] for j, needed in self._needed.items()}

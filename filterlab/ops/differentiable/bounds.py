@@ -10,14 +10,16 @@ from filterlab.ops import cpu
 from filterlab.ops.bounds import Bounds, Codes
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.gather import STORAGE
-from filterlab.ops.pieces import Lattice
+from filterlab.ops.tetrahedra import AnyLattice, TetrahedralLattice
 
 _FEWEST = 1 << 16
 """Cells from which on a program is worth to be compiled: plain torch takes 20 to 500 ns for each."""
 
 
-def missing(lattice: Lattice) -> str | None:
+def missing(lattice: AnyLattice) -> str | None:
     """What keeps the program from running here; None: nothing does."""
+    if isinstance(lattice, TetrahedralLattice):
+        return "it bounds sums over taps"
     if problem := cpu.llvmlite_problem():
         return problem
     c = lattice.coefficients
@@ -33,7 +35,7 @@ def missing(lattice: Lattice) -> str | None:
     return None
 
 
-def bounds(lattice: Lattice, edge: int, codes: Codes, implementation: str | None = None) -> Bounds:
+def bounds(lattice: AnyLattice, edge: int, codes: Codes, implementation: str | None = None) -> Bounds:
     """Those of parts of `edge`³ cells, an edge of 1 or 2.
 
     Args:

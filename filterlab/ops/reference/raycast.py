@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from filterlab.ops.pieces import Pieces
+from filterlab.ops.pieces import Lattice, Pieces
 from filterlab.ops.raycast import Candidates, Raycast, joined
 from filterlab.ops.reference.pieces import in_cells, pieces_of_rays
 from filterlab.roots import first_root
@@ -40,6 +40,7 @@ def _found(given: Raycast) -> Search:
 def _pieces(given: Raycast, origins: Tensor, directions: Tensor) -> Pieces:
     """The pieces of rays (R, 3) in bricks that may hold the level."""
     lattice = given.lattice
+    assert isinstance(lattice, Lattice), "pieces on tetrahedra are a field's own"
     own = in_cells(origins, directions, given.geometry, lattice)
     return pieces_of_rays(own, lattice, given.dtype, given.edge, given.marks > 0)
 

@@ -6,11 +6,12 @@ Letters as in `ops.reference.gather`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import torch
 from torch import Tensor
 
-from filterlab.ops.tetrahedra import Block, Sum, TetrahedralStencil
+from filterlab.ops.tetrahedra import Block, Sum, Tetrahedra, TetrahedralStencil
 
 
 class Tensors:
@@ -103,3 +104,52 @@ def spread(out: Tensor, cotangents: Tensor, at: Reads, offset: Tensor | int) -> 
     for index, values in zip(at.index + offset, every, strict=True):
         if values is not None:
             out.index_add_(1, index, values)
+
+
+# --- bounds -----------------------------------------------------------------------------------------------------------
+
+
+def ranges_of_cubes(samples: Tensor, spline: Tetrahedra) -> tuple[Tensor, Tensor]:
+    """(least, greatest) sample that the tetrahedra of every cube about a sample need, NaN where one is.
+
+    Args:
+        samples: (D, H, W), also those that the outermost cubes need; cubes are counted from an even index on.
+    """
+    low, high = -_largest_of_windows(-samples, spline.size), _largest_of_windows(samples, spline.size)
+    return (-_largest_of_blocks(-low), _largest_of_blocks(high)) if spline.octahedral else (low, high)
+
+
+def _largest_of_windows(values: Tensor, size: int) -> Tensor:
+    for dim in range(3):
+        values = values.unfold(dim, size, 1).amax(-1)
+    return values
+
+
+def _largest_of_blocks(blocks: Tensor) -> Tensor:
+    """Of the eight blocks of 2³ that a cube's two octahedra need: about their centres, and two steps beyond each.
+
+    The centres stand at sample ± σ / 2, σ = 1 along axes of even, −1 along those of odd indices.
+    """
+    out = blocks.new_empty([n - 3 for n in blocks.shape])
+    for parity in product((0, 1), repeat=3):
+        every_second = tuple(slice(p, None, 2) for p in parity)
+        count = out[every_second].shape
+        if 0 not in count:
+            parts = [_block(blocks, parity, count, centre) for centre in _centres(parity)]
+            out[every_second] = torch.stack(parts).amax(0)
+    return out
+
+
+def _centres(parity: Sequence[int]) -> list[tuple[int, ...]]:
+    """Twice the centres of a cube's blocks, from its sample."""
+    centres: list[tuple[int, ...]] = []
+    for side in (1, -1):
+        own = tuple(side * (1 - 2 * p) for p in parity)
+        centres += [own, *(tuple(c - 4 * c * (i == axis) for i, c in enumerate(own)) for axis in range(3))]
+    return centres
+
+
+def _block(blocks: Tensor, parity: Sequence[int], count: Sequence[int], centre: Sequence[int]) -> Tensor:
+    """Of every second cube along each axis, the block at that centre."""
+    first = (2 + p + (c - 1) // 2 for p, c in zip(parity, centre, strict=True))
+    return blocks[tuple(slice(a, a + 2 * n - 1, 2) for a, n in zip(first, count, strict=True))]
