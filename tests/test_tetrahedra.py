@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from torch import Tensor
 import filterlab as fl
 from filterlab.fields import tetrahedral
 from filterlab.fields.octahedral import QUADRATIC_C1
-from filterlab.fields.tetrahedral import Shape, Spline
+from filterlab.fields.tetrahedral import Shape
 from filterlab.fields.type6 import CUBIC_C1, QSS
 from filterlab.methods import METHODS, Tetrahedral
 from filterlab.render import PerspectiveCamera, TransferFunction
@@ -30,9 +31,10 @@ def samples(*shape: int, seed: int = 0) -> Tensor:
 
 
 def around(shape: tuple[int, ...], count: int, seed: int = 1) -> Tensor:
-    """Points up to two and a half periods outside that float32 holds exactly."""
+    """Points inside and up to two and a half periods outside that float32 holds exactly."""
     n = np.array(shape[::-1])
     points = np.random.default_rng(seed).uniform(-2.5, 3.5, (count, 3)) * n
+    points[::3] = np.random.default_rng(seed).uniform(-0.5, n - 0.5, (count, 3))[::3]
     return torch.as_tensor(points.astype(np.float32).astype(np.float64))
 
 
@@ -42,14 +44,15 @@ def around(shape: tuple[int, ...], count: int, seed: int = 1) -> Tensor:
 @every_spline
 @every_boundary
 @pytest.mark.parametrize("prefilter", [True, False])
-def test_axes_of_every_length(name, boundary, prefilter):
+@pytest.mark.parametrize("scheme", ["fused", "direct"])
+def test_axes_of_every_length(name, scheme, prefilter, boundary):
     """n = 1 … 9 and 32 along each axis: ≤ 1e-12 in float64, ≤ 5e-6 of the range in float32."""
     for n in (*range(1, 10), 32):
         shape = tuple(int(k) for k in np.roll((n, 3, 2), n % 3))
         f, points = samples(*shape, seed=n), around(shape, 24, seed=n)
         expected = tetrahedral_oracle.reconstruct(name, f.numpy(), points.numpy(), str(boundary), prefilter, 2)
         for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 5e-6)):
-            field = fl.reconstruct(f.to(dtype), name, boundary=boundary, prefilter=prefilter)
+            field = fl.reconstruct(f.to(dtype), name, boundary=boundary, prefilter=prefilter, scheme=scheme)
             for actual, exact in zip(field.jet(points.to(dtype), 2), expected, strict=True):
                 laws.assert_close(actual, exact, tolerance, 2 * max(1.0, float(np.abs(exact).max()) / 2))
 
@@ -151,8 +154,8 @@ def test_resampling_is_pointwise(name):
 def test_what_is_lacking_is_said(name):
     with pytest.raises(TypeError, match="measured only"):
         fl.spectrum.axis_response(name, torch.zeros(1))
-    with pytest.raises(ValueError, match="offers the schemes direct; got 'fused'"):
-        fl.reconstruct(samples(), name, scheme="fused")
+    with pytest.raises(ValueError, match="offers the schemes fused, direct; got 'sampled'"):
+        fl.reconstruct(samples(), name, scheme="sampled")
     with pytest.raises(ValueError, match="takes no samples between voxels"):
         fl.reconstruct(samples(), name, sampler="texture_unit")
 
@@ -196,9 +199,9 @@ def test_a_field_compiles_whole():
 def test_shapes_that_do_not_belong_together_are_refused():
     incomplete = Shape(QSS.shapes[0].vertices, dict(list(QSS.shapes[0].masks.items())[1:]))
     with pytest.raises(ValueError, match="expected a mask for every coefficient of degree 2"):
-        Spline("broken", 2, (incomplete,), QSS.cells, QSS.shift, 1)
+        replace(QSS, shapes=(incomplete,))
     with pytest.raises(ValueError, match="need different samples"):
-        Spline("broken", 2, (QSS.shapes[0], QUADRATIC_C1.shapes[0]), QSS.cells, QSS.shift, 1)
+        replace(QSS, shapes=(QSS.shapes[0], QUADRATIC_C1.shapes[0]))
 
 
 def test_norms_are_the_published_ones():

@@ -26,7 +26,7 @@ SOFT = TransferFunction(
     [0.1, 0.4, 0.9], [[0.2, 0.3, 0.9], [0.8, 0.5, 0.1], [0.4, 0.9, 0.3]], [0.01, 0.3, 0.1], unit=0.2
 )
 SCENE = {"size": (13, 11), "step": 0.6, "background": (0.1, 0.2, 0.3)}
-KINDS = [(name, gradient) for name in TENSOR_PRODUCTS for gradient in METHODS[name].gradients]
+KINDS = [(name, gradient) for name, method in METHODS.items() for gradient in method.gradients]
 TYPED = [(*kind, (torch.float32, torch.float64)[i % 2]) for i, kind in enumerate(KINDS)]
 TYPED += [("triquadratic", "analytic", torch.float32), ("ncrsi", "central", torch.float64)]
 
