@@ -16,7 +16,6 @@ from filterlab.ops.cpu import march as driver
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.plain import PlainMarcher
 from filterlab.volume import Boundary, Volume
-from tests.test_methods import TENSOR_PRODUCTS
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 BOUNDARIES = [b.value for b in Boundary]

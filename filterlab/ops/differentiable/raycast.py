@@ -9,6 +9,7 @@ from filterlab.ops import cpu, cuda
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.raycast import Candidates, Raycast
+from filterlab.ops.tetrahedra import TetrahedralLattice
 
 
 def missing(given: Raycast, origins: Tensor) -> str | None:
@@ -16,7 +17,10 @@ def missing(given: Raycast, origins: Tensor) -> str | None:
     if transforming():
         return "it has no transforms of torch.func"
     points = torch.empty(1, 0, 3, dtype=given.dtype, device=origins.device)
-    room = cuda if _implementation_for(given) == "cuda" else cpu
+    on_a_gpu = _implementation_for(given) == "cuda"
+    if on_a_gpu and isinstance(given.lattice, TetrahedralLattice):
+        return "on a GPU it casts sums over taps"
+    room = cuda if on_a_gpu else cpu
     if problem := room.missing(given.lattice.coefficients.detach()[None, None], points, given.lattice.stencil):
         return problem
     if given.marks.numel() >= 1 << 31:
