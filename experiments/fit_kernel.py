@@ -212,7 +212,7 @@ def _fit(config: Config, index: int, candidate: Candidate, unit: Unit, run: Run)
         for role in ROLES[:2]
     )
     state = minimize(
-        Fit.of(candidate, training, validation, config.family),
+        Fit.of(candidate, training, validation, candidate.start(config.family, config.device)),
         [Stage(iterations=config.iterations, learning_rate=config.learning_rate)],
         run.folder / "files" / f"{run.prefix}{unit.key}.state.pt".replace("/", "--"),
         observe_every=config.record_every,
