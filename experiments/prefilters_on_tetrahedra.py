@@ -29,7 +29,7 @@ from experiments import fir
 from experiments.comparison import QUANTITIES, compared
 from experiments.config import ExperimentConfig, Recipe, check_signal, increasing, number
 from experiments.descent import Parameters, Stage, minimize
-from experiments.fit_kernel import AnyClass, Count
+from experiments.fit_kernel import AnyClass, Count, check_class
 from experiments.fitting import Fit, Objective, parameters_of
 from experiments.isosurface_quality import Look, SurfaceDistance, noisy
 from experiments.members import Members, Role, Sampling, seed_of
@@ -123,6 +123,12 @@ class Config(ExperimentConfig):
     frequencies: Annotated[int, Field(ge=2, le=1000)] = 65
     pictures: Pictures | None = None
 
+    @model_validator(mode="after")
+    def _on_the_cpu(self) -> Config:
+        if self.device != "cpu":
+            raise ValueError("device: all of this is computed on the CPU; expected device: cpu")
+        return self
+
     @property
     def variants(self) -> list[str]:
         """The prefilters that are compared, none first."""
@@ -135,12 +141,11 @@ class Config(ExperimentConfig):
 
 
 def check(config: Config, path: str = "") -> None:
-    """Raises ConfigError unless the signals can be evaluated, and a scan that is learned from is here."""
+    """Raises ConfigError unless the signals can be evaluated, and a scan that is learned from is here and can be."""
     check_signal(config.signal, f"{path}signal")
     if config.pictures is not None:
         check_signal(config.pictures.signal, f"{path}pictures.signal")
-    if config.learning.source.kind == "scan":
-        config.learning.source.volume.check(f"{path}learning.source.volume")
+    check_class(config.learning.source, f"{path}learning.source")
 
 
 def units(config: Config) -> list[Unit]:

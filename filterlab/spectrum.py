@@ -93,9 +93,9 @@ def position_responses(method: str | Method | PiecewisePolynomial, omega: Tensor
     wave with frequency ω the mean over positions is kept, and where they differ waves of other frequencies are added,
     by π (1, 1, 0) and its like.
 
-    The integral is Gauss-Legendre quadrature with so many nodes along an axis on every half voxel. Where pieces are
-    boxes it is exact to 1e-11; faces of tetrahedra cross the half voxels: for |ω_d| ≤ 2π and 6 nodes it is off by 7e-5
-    (`qss`, C⁰ there) and 5e-6 (both C¹ splines), along the axes by 1e-7.
+    The integral is Gauss-Legendre quadrature with so many nodes along an axis on every half voxel. For |ω_d| ≤ 2π and 6
+    nodes it is off by 2e-11 where pieces are boxes; faces of tetrahedra cross the half voxels: 2e-4 (`qss`, C⁰ there)
+    and 8e-6 (both C¹ splines), along the axes 1e-11.
     """
     method = as_method(method)
     place = 2 * method.reach(False)  # even: the partition lies about it as about 0

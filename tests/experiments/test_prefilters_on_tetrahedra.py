@@ -17,11 +17,12 @@ from experiments.descent import Stage, minimize
 from experiments.fitting import Fit, Objective
 from experiments.isosurface_quality import noisy
 from experiments.members import Members, Sampling
-from experiments.prefilters_on_tetrahedra import Config, ShortPrefilter, equal_noise
+from experiments.prefilters_on_tetrahedra import Config, ShortPrefilter, check, equal_noise
 from experiments.report.prefilters_on_tetrahedra import draw
 from experiments.runs import read_records, run_file
 from filterlab import metrics, signals, spectrum
 from filterlab.io import load_image
+from filterlab.io.config import ConfigError
 
 TINY = {
     "experiment": "prefilters_on_tetrahedra",
@@ -174,7 +175,17 @@ def test_what_is_refused():
         ({"learning": {**TINY["learning"], "taps": [4]}}, "odd number of taps"),
         ({"learning": {**TINY["learning"], "taps": [5, 3]}}, "increasing"),
         ({"splines": ["qs"]}, "qss"),
+        ({"device": "cuda"}, "expected device: cpu"),
         ({"pictures": {**TINY["pictures"], "look": {"error": 1}}}, "leave it out"),
     ):
         with pytest.raises(ValueError, match=message):
             Config.model_validate({**TINY, **change})
+
+
+def test_a_scan_to_learn_from_that_cannot_be_parted_is_refused(tmp_path):
+    path = tmp_path / "small.npy"
+    fl.io.save_volume(fl.Volume(torch.zeros(2, 9, 9)), path)
+    source = {"kind": "scan", "title": "small", "volume": str(path)}
+    config = Config.model_validate({**TINY, "learning": {**TINY["learning"], "source": source}})
+    with pytest.raises(ConfigError, match=r"learning\.source\.volume.*halved and parted"):
+        check(config)
