@@ -42,6 +42,11 @@ class Recipe(Reconstruction):
         return self.gradient or fl.METHODS[self.name].gradients[0]
 
     @property
+    def first_scheme(self) -> str:
+        """The scheme asked for, else the method's first, which it takes where that can run."""
+        return self.scheme or fl.METHODS[self.name].schemes[0]
+
+    @property
     def declared_order(self) -> int:
         """The approximation order that the method declares, with or without its prefilter."""
         facts = fl.METHODS[self.name].facts

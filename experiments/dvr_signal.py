@@ -47,7 +47,7 @@ def units(config: Config) -> list[Unit]:
     view, n, name = config.view, config.resolution, config.signal.name
     return [
         Unit(TRUTH, f"{name} itself", 0.5 * view.seconds(n, "direct")),
-        *(Unit(r.key, f"{name} {n}³, {r.key}", view.seconds(n, r.scheme)) for r in config.methods),
+        *(Unit(r.key, f"{name} {n}³, {r.key}", view.seconds(n, r.first_scheme)) for r in config.methods),
     ]
 
 

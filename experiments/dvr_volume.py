@@ -60,7 +60,7 @@ def units(config: Config) -> list[Unit]:
     """One per method and view."""
     voxels, file = config.volume.extent(), config.volume.file
     return [
-        Unit(f"{recipe.key}/{name}", f"{file}, {recipe.key}, {name}", config.view.seconds(voxels, recipe.scheme))
+        Unit(f"{recipe.key}/{name}", f"{file}, {recipe.key}, {name}", config.view.seconds(voxels, recipe.first_scheme))
         for recipe in config.methods
         for name in config.windows
     ]

@@ -96,14 +96,18 @@ class Config(ExperimentConfig):
 def check(config: Config, path: str = "") -> None:
     """Raises ConfigError unless every scan is there and large enough to be parted."""
     for i, source in enumerate(config.classes):
-        if not isinstance(source, ScanClass):
-            continue
-        key = f"{path}classes[{i}].volume"
-        domain = source.volume.check(key)
-        shape = [round(b - a) for a, b in zip(domain.lower, domain.upper, strict=True)]
-        if least_extent(shape) < 2 or min(shape) < 3:
-            message = f"expected a volume that can be halved and parted; got {shape} voxels along x, y, z"
-            raise ConfigError([Problem(source.volume.file, key, message)])
+        check_class(source, f"{path}classes[{i}]")
+
+
+def check_class(source: AnyClass, path: str) -> None:
+    """Raises ConfigError, for the key of the class at `path`, unless its scan is there and can be parted."""
+    if not isinstance(source, ScanClass):
+        return
+    domain = source.volume.check(f"{path}.volume")
+    shape = [round(b - a) for a, b in zip(domain.lower, domain.upper, strict=True)]
+    if least_extent(shape) < 2 or min(shape) < 3:
+        message = f"expected a volume that can be halved and parted; got {shape} voxels along x, y, z"
+        raise ConfigError([Problem(source.volume.file, f"{path}.volume", message)])
 
 
 def units(config: Config) -> list[Unit]:
@@ -212,7 +216,7 @@ def _fit(config: Config, index: int, candidate: Candidate, unit: Unit, run: Run)
         for role in ROLES[:2]
     )
     state = minimize(
-        Fit.of(candidate, training, validation, config.family),
+        Fit.of(candidate, training, validation, candidate.start(config.family, config.device)),
         [Stage(iterations=config.iterations, learning_rate=config.learning_rate)],
         run.folder / "files" / f"{run.prefix}{unit.key}.state.pt".replace("/", "--"),
         observe_every=config.record_every,

@@ -13,7 +13,7 @@ weight of the gradient: 1 is as good as that method.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import torch
 from pydantic import AfterValidator, Field, model_validator
@@ -118,6 +118,14 @@ class Candidate(StrictModel):
         }
 
 
+class Learned(Protocol):
+    """What a descent can find parameters of; a `Candidate` is one."""
+
+    def reconstruct(self, parameters: Parameters, volume: fl.Volume, boundary: str) -> fl.Field:
+        """The field, differentiable in the parameters."""
+        ...
+
+
 def distinct(candidates: list[Candidate]) -> list[Candidate]:
     """The candidates. Raises ValueError unless they are all different."""
     keys = [c.key for c in candidates]
@@ -151,7 +159,7 @@ class Objective:
             raise ValueError(f"expected members that {recipe.key} is not exact for; got errors {value}, {gradient}")
         return cls(members, boundary, weight, (float(value), float(gradient)))
 
-    def __call__(self, candidate: Candidate, parameters: Parameters) -> Tensor:
+    def __call__(self, candidate: Learned, parameters: Parameters) -> Tensor:
         """What is minimised, 0-d, differentiable in the parameters."""
         value, gradient = self.members.mean_squares(
             candidate.reconstruct(parameters, self.members.volume, self.boundary)
@@ -162,7 +170,7 @@ class Objective:
 
 @dataclass(frozen=True)
 class Fit:
-    """The descent to the parameters of a candidate (`experiments.descent.Problem`); one stage.
+    """The descent to the parameters of what is learned (`experiments.descent.Problem`); one stage.
 
     The parameters p can nearly stand for each other where the members hold no high frequencies: a descent in them would
     creep. It goes along z instead, p = p₀ + W z, with W the inverse root of the Hessian at p₀, scaled so that a z of
@@ -176,16 +184,14 @@ class Fit:
         whitening: W.
     """
 
-    candidate: Candidate
+    candidate: Learned
     training: Objective
     validation: Objective
     first: Parameters
     whitening: Tensor
 
     @classmethod
-    def of(cls, candidate: Candidate, training: Objective, validation: Objective, family: tuple[float, float]) -> Fit:
-        """`family`: B and C to begin with."""
-        first = candidate.start(family, str(training.members.points.device))
+    def of(cls, candidate: Learned, training: Objective, validation: Objective, first: Parameters) -> Fit:
         flat = torch.cat(list(first.values()))
         height = lambda p: training(candidate, _parts(p, first))  # noqa: E731
         eigenvalues, basis = torch.linalg.eigh(torch.func.hessian(height)(flat))

@@ -36,7 +36,6 @@ from experiments.signal_surface import SignalSurface
 from experiments.views import Window, magnified
 from filterlab.fields.base import Domain
 from filterlab.io.config import ConfigError, Problem, StrictModel
-from filterlab.render.camera import Camera
 from filterlab.render.materials import ByField, Material, Phong
 from filterlab.render.raycast import raycast
 from filterlab.render.transfer import TransferFunction
@@ -70,6 +69,19 @@ class Look(StrictModel):
     background: scene.Color = (1.0, 1.0, 1.0)
     error: scene.Positive | None = None
 
+    def cast(self, surface: Surface, material: Material, window: Window | None = None, **options: Any) -> Any:
+        """What `raycast` makes of the surface, whole or through a window."""
+        return raycast(
+            surface,
+            magnified(self.camera, window).build(surface.domain, self.size),
+            material,
+            size=self.size,
+            lights=self.lighting.build().lights,
+            background=self.background,
+            region=self.region.build() if self.region else None,
+            **options,
+        )
+
 
 class Figure(StrictModel):
     """One surface, with every method.
@@ -78,6 +90,7 @@ class Figure(StrictModel):
         title: of the figure.
         signal, resolution: what is sampled, on how many voxels along each axis; or
         volume: a scan. An optional one that is not there is skipped.
+        noise: standard deviation of what is added to the samples of a signal, independent and Gaussian, in its values.
         surface: level, material and the rest, as in a scene.
         zooms: what is magnified.
     """
@@ -86,6 +99,7 @@ class Figure(StrictModel):
     signal: scene.SignalModel | None = None
     resolution: Annotated[int, Field(ge=2, le=1024)] | None = None
     volume: VolumeChoice | None = None
+    noise: Annotated[float, Field(ge=0)] = 0.0
     surface: scene.SurfaceModel
     methods: Recipes
     marching_cubes: bool = True
@@ -97,6 +111,8 @@ class Figure(StrictModel):
     def _consistent(self) -> Figure:
         if (self.signal is None) == (self.volume is None) or (self.signal is None) != (self.resolution is None):
             raise ValueError("expected either a signal and its resolution, or a volume")
+        if self.noise and self.signal is None:
+            raise ValueError("noise: it is added to the samples of a signal; a scan has its own, leave it out")
         if self.look.error is not None and self.signal is None:
             raise ValueError("look.error: a scan has no surface of its own to be compared with; leave it out")
         if self.look.error is not None and not isinstance(self.surface.material, scene.PhongModel):
@@ -232,7 +248,16 @@ def _volume(config: Config, figure: Figure) -> fl.Volume:
     if figure.volume is not None:
         return figure.volume.load().to(dtype)
     assert figure.resolution is not None
-    return _signal(figure).sample(figure.resolution, dtype=dtype)
+    return noisy(_signal(figure).sample(figure.resolution, dtype=dtype), figure.noise, config.seed)
+
+
+def noisy(volume: fl.Volume, deviation: float, seed: int) -> fl.Volume:
+    """The volume with independent Gaussian noise of that standard deviation, the same for every type of samples."""
+    if not deviation:
+        return volume
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(volume.samples.shape, generator=generator, dtype=torch.float64)
+    return fl.Volume.with_geometry(volume.samples + deviation * noise.to(volume.samples), volume.geometry)
 
 
 class SurfaceDistance(fl.Field):
@@ -257,15 +282,10 @@ def _drawn(
     config: Config, figure: Figure, surface: Surface, window: Window | None, run: Run
 ) -> tuple[Tensor, dict[str, Any]]:
     """(linear RGB (H, W, 3), what is known of the points that are seen)."""
-    look = figure.look
-    cast: Callable[..., Any] = lambda **options: raycast(  # noqa: E731
+    cast: Callable[..., Any] = lambda **options: figure.look.cast(  # noqa: E731
         surface,
-        _camera(figure, surface.domain, window),
         _material(figure),
-        size=look.size,
-        lights=look.lighting.build().lights,
-        background=look.background,
-        region=look.region.build() if look.region else None,
+        window,
         shadows=figure.surface.shadows,
         seed=config.seed,
         dtype=torch_dtype(config.dtype),
@@ -277,10 +297,6 @@ def _drawn(
     seen = cast(channels=("color", "position", "sheets"))
     hit = seen["sheets"][..., 0] > 0
     return seen["color"][..., :3].float(), {"hit": float(hit.double().mean())} | _errors(figure, seen["position"][hit])
-
-
-def _camera(figure: Figure, domain: Domain, window: Window | None) -> Camera:
-    return magnified(figure.look.camera, window).build(domain, figure.look.size)
 
 
 def _material(figure: Figure) -> Material:

@@ -40,11 +40,14 @@ def _known(name: str) -> str:
     return name
 
 
+SplineName = Annotated[str, AfterValidator(_known)]
+
+
 class Config(ExperimentConfig):
     """Cells of splines, and patches in them."""
 
     experiment: Literal["partitions"]
-    splines: Annotated[list[Annotated[str, AfterValidator(_known)]], Field(min_length=1)]
+    splines: Annotated[list[SplineName], Field(min_length=1)]
     noise: Annotated[float, Field(ge=0)] = 1.0
     fineness: Annotated[int, Field(ge=2, le=64)] = 6
 

@@ -36,6 +36,7 @@ _NAMES = (
     "hit_error",
     "isosurface_quality",
     "partitions",
+    "prefilters_on_tetrahedra",
     "demo",
 )
 

@@ -119,14 +119,10 @@ class View(StrictModel):
         count = segment_count(inside.length, self.step * domain.voxel_size).sum()
         return float(count) * (self.size[0] * self.size[1]) / (width * height)
 
-    def seconds(self, voxels: float, scheme: str | None) -> float:
-        """A rough expectation for an image of a volume with that many voxels along an axis.
-
-        Args:
-            scheme: of the field; None: the default, which is fused where it can run.
-        """
+    def seconds(self, voxels: float, scheme: str) -> float:
+        """A rough expectation for an image of a volume with that many voxels along an axis, of a field's scheme."""
         width, height = self.size
-        marcher = "fused" if scheme in (None, "fused") else "plain"
+        marcher = "fused" if scheme == "fused" else "plain"
         return width * height * voxels / self.step * SECONDS_PER_SAMPLE[marcher] + 0.2
 
     def draw(self, field: fl.Field, run: Progress, device: str, dtype: Dtype) -> Tensor:

@@ -108,6 +108,11 @@ class Method(ABC):
         """The kind of gradient that a scheme gives when it is not told."""
         return self.gradients[0]
 
+    @property
+    def period(self) -> int:
+        """By how many voxels along an axis a volume is moved for the same field, moved."""
+        return 1
+
     @abstractmethod
     def reach(self, prefilter: bool) -> int:
         """How far from a sample, in voxels, the field depends on it in float64."""
@@ -274,6 +279,10 @@ class Tetrahedral(Method):
         if sampler != "exact":
             raise ValueError(f"sampler={sampler!r} needs scheme='sampled'; {self.name} takes no samples between voxels")
         return OnTetrahedra(self.spline, name or self.schemes[0])
+
+    @property
+    def period(self) -> int:
+        return self.spline.period
 
     def reach(self, prefilter: bool) -> int:
         return self.spline.support + (self.prefilter.decay(torch.float64) if prefilter else 0)

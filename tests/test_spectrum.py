@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from filterlab import spectrum
+from filterlab import prefilters, spectrum
 from filterlab.kernels import KERNELS
 from filterlab.methods import METHODS, reconstruct
 from filterlab.prefilters import Prefilter
@@ -86,6 +86,42 @@ def test_the_response_of_a_nonseparable_method_is_the_transform_of_its_impulse_r
         expected = torch.einsum("xyz,x,y,z->", h, *waves)
         actual = spectrum.response(method, torch.tensor(omega, dtype=torch.float64))
         assert float(actual) == pytest.approx(float(expected), abs=1e-10)
+
+
+@pytest.mark.parametrize("method", ["ncrsi", "notch", "tricubic"])
+def test_responses_by_position_are_the_closed_form_where_there_is_one(method):
+    omega = 6 * torch.rand(5, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = spectrum.position_responses(method, omega)
+    assert found.shape == (1, 5)
+    laws.assert_close(found[0], spectrum.response(method, omega, prefilter=False), 1e-10)
+
+
+@pytest.mark.parametrize(("name", "positions"), [("qss", 1), ("cubic-c1", 1), ("quadratic-c1", 4)])
+def test_responses_of_splines_on_tetrahedra(name, positions):
+    """Along each axis, at every position, that of the quadratic B-spline; constants are reproduced; order two."""
+    omega = torch.zeros(4, 3, dtype=torch.float64)
+    omega[range(3), range(3)] = torch.tensor([0.9, 2.5, 5.0], dtype=torch.float64)
+    found = spectrum.position_responses(name, omega, nodes=4)
+    assert found.shape == (positions, 4)
+    expected = spectrum.kernel_response(KERNELS["bspline2"], omega).prod(-1)
+    laws.assert_close(found, expected.expand(positions, -1), 1e-5)
+    aliases = 2 * pi * torch.tensor([(1, 0, 0), (1, 1, 0), (1, 1, 1), (0, 1, -1)], dtype=torch.float64)
+    laws.assert_close(spectrum.position_responses(name, aliases, nodes=4).mean(0), torch.zeros(4), 5e-4)
+    oblique = torch.tensor([(0.02, 0.03, -0.01), (1.0, 2.0, 3.0)], dtype=torch.float64)
+    small, wide = spectrum.position_responses(name, oblique, nodes=4).unbind(-1)
+    # Q f = f + h²/8 Δf + …
+    assert float(1 - small.mean()) == pytest.approx(float(oblique[0].square().sum()) / 8, rel=1e-2)
+    assert (float(wide.amax() - wide.amin()) > 1e-3) == (positions > 1)
+
+
+@pytest.mark.parametrize("prefilter", [True, False])
+def test_the_measured_response_of_splines_on_tetrahedra_is_the_mean_over_positions(prefilter):
+    omega = torch.tensor([0.0, 1.0, 3.0, 5.0], dtype=torch.float64)
+    points = torch.stack([omega, 0 * omega, 0 * omega], -1)
+    expected = spectrum.position_responses("quadratic-c1", points, nodes=4).mean(0)
+    if prefilter:
+        expected = expected * prefilters.QUADRATIC.response(omega)
+    laws.assert_close(spectrum.measured_response("quadratic-c1", omega, prefilter), expected, 1e-5)
 
 
 @every_method

@@ -70,7 +70,7 @@ def _detail(record: Record) -> str:
 def _whole_caption(figure: Figure) -> str:
     width, height = figure.look.size
     if figure.signal is not None:
-        what = f"{figure.signal.label}, sampled at {figure.resolution}³ cell centres"
+        what = f"{figure.signal.label}, sampled at {figure.resolution}³ cell centres{_noise(figure)}"
     else:
         assert figure.volume is not None
         what = figure.volume.file.rpartition("/")[2].rpartition(":")[2]
@@ -80,6 +80,10 @@ def _whole_caption(figure: Figure) -> str:
     if figure.signal is not None:
         caption += " Below each: how far points seen are from the signal's surface, median and what 95 % stay below."
     return caption + (" Frames mark what is magnified below." if figure.zooms else "")
+
+
+def _noise(figure: Figure) -> str:
+    return f", with noise of standard deviation {figure.noise:g} in them" if figure.noise else ""
 
 
 def _zoom_caption(zoom: Zoom) -> str:

@@ -107,6 +107,17 @@ def test_a_recipe_knows_its_defaults():
     assert Recipe(name="triquadratic", prefilter=False).declared_order == 2
 
 
+def test_what_is_in_plain_torch_is_expected_to_take_longer():
+    """A spline on tetrahedra has no fused march, unless its method says so."""
+    method = fl.METHODS["qss"]
+    assert Recipe(name="qss").first_scheme == method.schemes[0]
+    assert Recipe(name="notch").first_scheme == "fused"
+    assert Recipe(name="notch", scheme="direct").first_scheme == "direct"
+    _, experiment, config = load("tetrahedral_dvr")
+    seconds = {unit.key: unit.seconds for unit in experiment.units(config)}
+    assert (seconds["qss"] > 5 * seconds["notch"]) == ("fused" not in method.schemes)
+
+
 def test_the_sampled_scheme_says_which_gradient_it_gives():
     with pytest.raises(ValueError, match="central"):
         Recipe(name="trilinear", scheme="sampled")

@@ -202,6 +202,26 @@ def tiny(name, scan):
         "methods": ["trilinear", {"name": "trilinear", "gradient": "central"}, "triquadratic"],
         "rays": 40,
     }
+    configs["prefilters_on_tetrahedra"] = {
+        "splines": ["cubic-c1"],
+        "learning": {
+            "source": {"kind": "waves", "title": "waves", "bandwidth": 0.5, "waves": 4},
+            "taps": [3],
+            "training": 1,
+            "validation": 1,
+            "test": 1,
+            "points": 10,
+            "test_points": 10,
+            "resolution": 6,
+            "iterations": 2,
+        },
+        "signal": "gaussian",
+        "resolutions": [6],
+        "noise": [0.1],
+        "points": 20,
+        "frequencies": 5,
+        "pictures": {"signal": "torus", "resolution": 8, "level": 0, "noise": 0.01, "look": {"size": [8, 6]}},
+    }
     configs["isosurface_quality"] = {
         "figures": [
             {

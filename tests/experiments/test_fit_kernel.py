@@ -257,7 +257,7 @@ def made_by(candidate, parameters, members):
 def test_the_filter_that_made_the_data_is_found(candidate, known, tmp_path):
     truth = parameters_of(known)
     training, validation = (objective(made_by(candidate, truth, waves(role))) for role in ("training", "validation"))
-    found = learned(Fit.of(candidate, training, validation, (1 / 3, 1 / 3)), tmp_path, 150)
+    found = learned(Fit.of(candidate, training, validation, candidate.start((1 / 3, 1 / 3))), tmp_path, 150)
     for name, value in truth.items():
         torch.testing.assert_close(found[name], value, atol=2e-3, rtol=0)
 
@@ -274,7 +274,7 @@ def test_the_filter_that_made_the_data_is_found(candidate, known, tmp_path):
 def test_on_quadratics_the_conditions_of_quasi_interpolation_are_learned(candidate, condition, tmp_path):
     terms = {(2, 0, 0): 1.0, (0, 2, 0): -0.7, (0, 0, 2): 0.4, (1, 1, 0): 0.5, (0, 0, 1): 1.0}
     f = objective(Members.of_signals([signals.polynomial(terms)], SAMPLING, 60, 1), weight=0)
-    found = learned(Fit.of(candidate, f, f, (0.0, 0.0)), tmp_path, 150)
+    found = learned(Fit.of(candidate, f, f, candidate.start((0.0, 0.0))), tmp_path, 150)
     assert float(condition(found)) == pytest.approx(0, abs=2e-3)
 
 

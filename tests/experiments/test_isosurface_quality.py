@@ -9,7 +9,7 @@ import yaml
 
 import filterlab as fl
 from experiments.__main__ import main
-from experiments.isosurface_quality import Config, SurfaceDistance
+from experiments.isosurface_quality import Config, SurfaceDistance, noisy
 from experiments.registry import EXPERIMENTS
 from experiments.runs import read_records
 from filterlab.io import load_image
@@ -53,6 +53,28 @@ def test_distances_are_those_to_a_sphere():
     signal = fl.signals.sphere(radius=0.6, edge=0.2).with_voxel_size(0.05)
     points = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1) * 0.6004
     assert_close(SurfaceDistance(signal, 0.5)(points), np.full(50, 0.0004 / 0.05), 1e-5)
+
+
+def test_noise_is_in_the_samples_alone(ran):
+    """The truth stays; what is reconstructed from noisy samples is off by the noise over the gradient."""
+    _, records, page = ran({**FIGURE, "resolution": 20, "noise": 0.01, "methods": ["tricubic"]}, dtype="float64")
+    errors = {key.split("/")[1]: r["distance_median"] for key, r in records.items() if r["view"] == "whole"}
+    assert errors["signal"] < 1e-12
+    assert (
+        0.02 < errors["tricubic"] < 0.5
+    )  # 0.01 ÷ (0.6 · 0.1 world units a voxel), times what a median is of a deviation
+    assert "with noise of standard deviation 0.01 in them" in page
+
+
+def test_noise_is_independent_and_of_its_deviation():
+    volume = fl.Volume(torch.zeros(20, 20, 20, dtype=torch.float64), spacing=(1.0, 2.0, 3.0))
+    loud = noisy(volume, 0.5, 3)
+    assert float(loud.samples.std()) == pytest.approx(0.5, rel=0.03)
+    assert float((loud.samples[1:] * loud.samples[:-1]).mean()) == pytest.approx(0, abs=0.01)
+    assert loud.geometry == volume.geometry
+    assert torch.equal(noisy(volume, 0.5, 3).samples, loud.samples)
+    assert not torch.equal(noisy(volume, 0.5, 4).samples, loud.samples)
+    assert noisy(volume, 0.0, 3) is volume
 
 
 def test_colours_tell_errors(ran):
