@@ -36,6 +36,7 @@ _NAMES = (
     "hit_error",
     "isosurface_quality",
     "partitions",
+    "tetrahedral_table",
     "demo",
 )
 

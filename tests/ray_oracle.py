@@ -129,7 +129,18 @@ def _critical(c: np.ndarray) -> np.ndarray:
         matrix[:, m - 1] -= (p[:-1] / leading / 2).T
     else:
         matrix[:, 0, 0] = -p[0] / leading
-    return np.clip(np.nan_to_num(np.linalg.eigvals(matrix).real), -1, 1)
+    return _polished(p, np.clip(np.nan_to_num(np.linalg.eigvals(matrix).real), -1, 1))
+
+
+def _polished(p: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Zeros x (P, m) of polynomials (m + 1, P), nearer: where a leading coefficient is rounding they are 1e-3 off."""
+    slope = chebyshev.chebder(p)
+    for _ in range(4):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.nan_to_num(_value(p, x) / _value(slope, x), nan=0.0, posinf=0.0, neginf=0.0)
+        nearer = np.clip(x - step, -1, 1)
+        x = np.where(np.abs(_value(p, nearer)) < np.abs(_value(p, x)), nearer, x)
+    return x
 
 
 def _value(c: np.ndarray, x: np.ndarray) -> np.ndarray:
