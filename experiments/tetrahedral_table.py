@@ -15,14 +15,15 @@ from itertools import count
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 from torch import Tensor
 
 import filterlab as fl
-from experiments.config import BoundaryName, Recipe, VolumeChoice, check_signal, distinct
+from experiments.config import BoundaryName, Recipe, distinct
 from experiments.dvr_volume import WHOLE, Zoom
 from experiments.partitions import SPLINES
 from experiments.runs import Record, Run, Unit
+from experiments.sampled import Sampled
 from experiments.timing import CLOCKS, TimedConfig, quartile_record
 from experiments.views import Window, magnified
 from filterlab.costs import Quartiles, coefficient_bytes, take_turns
@@ -30,7 +31,7 @@ from filterlab.fields.determining import Determining, Held
 from filterlab.fields.octahedral import JETS
 from filterlab.fields.tetrahedral_pieces import FieldOnTetrahedra
 from filterlab.fields.type6 import D2, D3
-from filterlab.io.config import ConfigError, Problem, StrictModel, unknown_name
+from filterlab.io.config import ConfigError, Problem, unknown_name
 from filterlab.render.raycast import raycast
 from filterlab.scenes import model as scene
 from filterlab.surfaces import LevelSet
@@ -46,36 +47,20 @@ NUMBERS: dict[str, tuple[str, Determining]] = {
 SECONDS_PER_RAY = 4e-4  # only expectations use it
 
 
-class Source(StrictModel):
+class Source(Sampled):
     """A volume, and a level of it.
 
     Attributes:
         title: of its section.
-        signal, resolution: what is sampled, on how many voxels along each axis; or
-        volume: a scan. An optional one that is not there is skipped.
         published: the row of the 2008 table that is of the same volume and level.
         zoom: the close-up.
     """
 
     title: Annotated[str, Field(min_length=1)]
-    signal: scene.SignalModel | None = None
-    resolution: Annotated[int, Field(ge=2, le=1024)] | None = None
-    volume: VolumeChoice | None = None
     level: float
     published: Literal["neghip", "dragon", "aneurism", "lobbster", "foot", "bonsai"] | None = None
     camera: scene.CameraView = scene.CameraView()
     zoom: Zoom
-
-    @model_validator(mode="after")
-    def _one(self) -> Source:
-        if (self.signal is None) == (self.volume is None) or (self.signal is None) != (self.resolution is None):
-            raise ValueError("expected either a signal and its resolution, or a volume")
-        return self
-
-    @property
-    def present(self) -> bool:
-        """Whether there is something to measure."""
-        return self.volume is None or self.volume.present
 
     @property
     def windows(self) -> dict[str, Window | None]:
@@ -130,14 +115,10 @@ def check(config: Config, path: str = "") -> None:
     """Raises ConfigError unless signals can be evaluated, and scans, but for optional ones, are here."""
     for i, source in enumerate(config.sources):
         own = f"{path}sources[{i}]"
-        if source.signal is not None:
-            domain = check_signal(source.signal, f"{own}.signal").domain
-        elif source.volume is not None and source.present:
-            domain = source.volume.check(f"{own}.volume")
-        else:
-            continue
+        domain = source.check(own)
         try:
-            source.camera.build(domain, config.sizes[0])
+            if domain is not None:
+                source.camera.build(domain, config.sizes[0])
         except ValueError as error:
             raise ConfigError([Problem(source.title, f"{own}.camera", str(error))]) from None
 
@@ -256,11 +237,10 @@ def _change(config: Config, surface: LevelSet) -> float:
     center = torch.tensor([domain.center], dtype=torch.float32, device=config.device)
     direction = torch.tensor([[0.3, 0.5, 1.0]], device=config.device)
     origin = center - domain.diagonal * direction
-    steps = count(1)
+    level, steps = float(surface.level), count(1)
+    step = 1e-9 * max(abs(level), 1.0)
     work = {
-        "changed": lambda: LevelSet(surface.field, float(surface.level) * (1 + 1e-9 * next(steps))).hit(
-            origin, direction
-        ),
+        "changed": lambda: LevelSet(surface.field, level + step * next(steps)).hit(origin, direction),
         "kept": lambda: surface.hit(origin, direction),
     }
     found = take_turns(work, seconds=config.seconds, clock=CLOCKS[config.clock]).seconds
@@ -274,6 +254,7 @@ def _change(config: Config, surface: LevelSet) -> float:
 def _frames(config: Config, source: Source, surface: LevelSet, run: Run, stem: str) -> tuple[list[Record], Tensor]:
     """Every view at every size, and points of the surface that are seen in them, evenly chosen."""
     frames, seen = [], []
+    _cast(surface, source.camera, (8, 8))  # what is found out about a field once is not the pictures'
     work = [(view, size) for view in source.windows for size in config.sizes]
     for n, (view, size) in enumerate(work):
         camera = magnified(source.camera, source.windows[view])
