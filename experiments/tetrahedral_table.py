@@ -199,6 +199,7 @@ def _forms(
     name, given = NUMBERS[field.scheme.spline.name]
     held, seconds = _timed(config, lambda: Held.of(field, given, torch.float32, level))
     voxels = field.domain.geometry.to_voxel(points.double()).float()
+    voxels = voxels.clamp(*(voxels.new_tensor(end) for end in (field.domain.lower, field.domain.upper)))
     times = {"samples": [], name: []}
     if len(points):
         work = {"samples": lambda: field.jet(points, 1), name: lambda: held.jet(voxels, 1)}

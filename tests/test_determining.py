@@ -125,3 +125,19 @@ def test_numbers_that_no_turn_leads_to_are_refused():
     one_corner = Determining.of_cell(D2.spline, D2.masks[:1], D2.rule)
     with pytest.raises(KeyError):
         one_corner.tables  # noqa: B018
+
+
+def test_bad_input_is_refused():
+    own = field("qss")
+    held = Held.of(own, D2, torch.float64)
+    with pytest.raises(ValueError, match="points of the domain, in voxels; 1 lie outside"):
+        held.jet(torch.tensor([[0.0, 0.0, 0.0], [7.0, 0.0, 0.0]]), 0)
+    with pytest.raises(ValueError, match="expected a field of cubic-c1"):
+        Held.of(own, D3, torch.float64)
+    with pytest.raises(ValueError, match="select"):
+        Held.of(field("qss", shape=(2, 1, 4, 4, 4)), D2, torch.float64)
+    axis = torch.arange(24, dtype=torch.float64)
+    steps = fl.reconstruct(axis.expand(24, 24, 24).contiguous(), "qss")
+    assert isinstance(steps, FieldOnTetrahedra)
+    with pytest.raises(ValueError, match="whose numbers are held; 1 are not"):
+        Held.of(steps, D2, torch.float64, 5.0).jet(torch.tensor([[5.0, 9.0, 9.0], [20.0, 9.0, 9.0]]), 0)

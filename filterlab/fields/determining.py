@@ -160,7 +160,14 @@ class Held:
 
     @classmethod
     def of(cls, field: FieldOnTetrahedra, given: Determining, dtype: torch.dtype, level: float | None = None) -> Held:
-        """Of all cells that the domain meets, or of those that may hold a level."""
+        """Of all cells that the domain meets, or of those that may hold a level.
+
+        Raises ValueError for a batched field, or numbers that are of another spline than the field's.
+        """
+        if field.channels is not None:
+            raise ValueError("numbers are those of one channel: `select` it from this batched field")
+        if field.scheme.spline is not given.spline:
+            raise ValueError(f"expected a field of {given.spline.name}, which the numbers are of; got {field!r}")
         period, size = given.spline.period, field.coefficients.size
         lower = -period
         x, y, z = ((n + 2 * period + period - 1) // period for n in size)
@@ -190,10 +197,15 @@ class Held:
         return self.numbers.nbytes, place
 
     def coefficients(self, at: Located) -> Tensor:
-        """(B, P) Bernstein coefficients of points' tetrahedra."""
+        """(B, P) Bernstein coefficients of points' tetrahedra. Raises ValueError where a cell of one is not held."""
         tables, n = self.given.tables.to(self.numbers.device), len(self.given.masks)
         code = _code(at.ranks, at.sign)
         rows = torch.stack([self._rows(at.cell + step.index_select(1, code)) for step in tables.steps])
+        if self.place is not None and bool((rows < 0).any()):
+            lost = int((rows < 0).any(0).sum())
+            raise ValueError(
+                f"expected points in cells that may hold the level, whose numbers are held; {lost} are not"
+            )
         index = rows.index_select(0, tables.which) * n + tables.number.index_select(1, code)
         found = self.numbers.view(-1).index_select(0, index.view(-1)).view(index.shape)
         if tables.sign is not None:
@@ -210,7 +222,14 @@ class Held:
         return row if self.place is None else self.place.index_select(0, row).long()
 
     def jet(self, points: Tensor, order: int) -> list[Tensor]:
-        """Rows (J, P) of derivatives of each order per voxel, at points (P, 3) of the domain in voxel coordinates."""
+        """Rows (J, P) of derivatives of each order per voxel, at points (P, 3) of the domain in voxel coordinates.
+
+        Raises ValueError for points outside of the domain, and as `coefficients` does.
+        """
+        domain = self.field.domain
+        outside = ((points < points.new_tensor(domain.lower)) | (points > points.new_tensor(domain.upper))).any(-1)
+        if bool(outside.any()):
+            raise ValueError(f"expected points of the domain, in voxels; {int(outside.sum())} lie outside of it")
         jet = replace(self.field.evaluated, order=order)
         parts = []
         for part in points.split(1 << 13):
