@@ -24,14 +24,13 @@ from experiments.config import (
     ExperimentConfig,
     Recipe,
     Recipes,
-    VolumeChoice,
-    check_signal,
     number,
     torch_dtype,
 )
 from experiments.dvr_signal import TRUTH
 from experiments.dvr_volume import WHOLE, Zoom
 from experiments.runs import Record, Run, Unit, timed
+from experiments.sampled import Sampled
 from experiments.signal_surface import SignalSurface
 from experiments.views import Window, magnified
 from filterlab.fields.base import Domain
@@ -83,22 +82,17 @@ class Look(StrictModel):
         )
 
 
-class Figure(StrictModel):
+class Figure(Sampled):
     """One surface, with every method.
 
     Attributes:
         title: of the figure.
-        signal, resolution: what is sampled, on how many voxels along each axis; or
-        volume: a scan. An optional one that is not there is skipped.
         noise: standard deviation of what is added to the samples of a signal, independent and Gaussian, in its values.
         surface: level, material and the rest, as in a scene.
         zooms: what is magnified.
     """
 
     title: Annotated[str, Field(min_length=1)]
-    signal: scene.SignalModel | None = None
-    resolution: Annotated[int, Field(ge=2, le=1024)] | None = None
-    volume: VolumeChoice | None = None
     noise: Annotated[float, Field(ge=0)] = 0.0
     surface: scene.SurfaceModel
     methods: Recipes
@@ -109,8 +103,6 @@ class Figure(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> Figure:
-        if (self.signal is None) == (self.volume is None) or (self.signal is None) != (self.resolution is None):
-            raise ValueError("expected either a signal and its resolution, or a volume")
         if self.noise and self.signal is None:
             raise ValueError("noise: it is added to the samples of a signal; a scan has its own, leave it out")
         if self.look.error is not None and self.signal is None:
@@ -120,11 +112,6 @@ class Figure(StrictModel):
         if self.surface.axis != "raw" or self.surface.sheets != 1:
             raise ValueError("surface: expected axis: raw and sheets: 1, which all surfaces here share")
         return self
-
-    @property
-    def present(self) -> bool:
-        """Whether there is something to show."""
-        return self.volume is None or self.volume.present
 
     @property
     def contenders(self) -> list[str]:
@@ -156,13 +143,9 @@ def check(config: Config, path: str = "") -> None:
     """Raises ConfigError unless the signals can be evaluated, and the scans, but for optional ones, are here."""
     for i, figure in enumerate(config.figures):
         own = f"{path}figures[{i}]"
-        if figure.signal is not None:
-            domain = check_signal(figure.signal, f"{own}.signal").domain
-        elif figure.volume is not None and figure.present:
-            domain = figure.volume.check(f"{own}.volume")
-        else:
-            continue
-        _check_camera(figure, domain, f"{own}.look.camera")
+        domain = figure.check(own)
+        if domain is not None:
+            _check_camera(figure, domain, f"{own}.look.camera")
 
 
 def _check_camera(figure: Figure, domain: Domain, path: str) -> None:

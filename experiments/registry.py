@@ -37,6 +37,7 @@ _NAMES = (
     "isosurface_quality",
     "partitions",
     "prefilters_on_tetrahedra",
+    "tetrahedral_table",
     "demo",
 )
 

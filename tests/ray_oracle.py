@@ -87,8 +87,13 @@ def crossings(f: Sum, origins: np.ndarray, directions: np.ndarray, level: float,
     t = low[:, None] + (high - low)[:, None] * (nodes + 1) / 2
     values = f((o[ray, None] + t[..., None] * d[ray, None]).reshape(-1, 3)).reshape(t.shape) - level
     c = np.linalg.solve(chebyshev.chebvander(nodes, f.degree), values.T)  # (n + 1, P)
+    return of_pieces(len(o), ray, low, high, c, close)
+
+
+def of_pieces(rays: int, ray, low, high, c, close: float) -> list[Truth]:
+    """Zeros of polynomials with Chebyshev coefficients (n + 1, P) on [low, high] (P), in the order of their rays."""
     stops = np.sort(np.concatenate((-np.ones((len(ray), 1)), _critical(c), np.ones((len(ray), 1))), 1), 1)
-    return _between(len(o), ray, low, high, c, stops, close)
+    return _between(rays, ray, low, high, c, stops, close)
 
 
 def _ends(f: Sum, o: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -124,7 +129,18 @@ def _critical(c: np.ndarray) -> np.ndarray:
         matrix[:, m - 1] -= (p[:-1] / leading / 2).T
     else:
         matrix[:, 0, 0] = -p[0] / leading
-    return np.clip(np.nan_to_num(np.linalg.eigvals(matrix).real), -1, 1)
+    return _polished(p, np.clip(np.nan_to_num(np.linalg.eigvals(matrix).real), -1, 1))
+
+
+def _polished(p: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Zeros x (P, m) of polynomials (m + 1, P), nearer: where a leading coefficient is rounding they are 1e-3 off."""
+    slope = chebyshev.chebder(p)
+    for _ in range(4):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.nan_to_num(_value(p, x) / _value(slope, x), nan=0.0, posinf=0.0, neginf=0.0)
+        nearer = np.clip(x - step, -1, 1)
+        x = np.where(np.abs(_value(p, nearer)) < np.abs(_value(p, x)), nearer, x)
+    return x
 
 
 def _value(c: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -136,11 +152,8 @@ def _between(rays: int, ray, low, high, c, stops, close: float) -> list[Truth]:
     """Crossings between stops (P, K) of pieces (P) in the order of rays, on each of which f is monotone."""
     own = np.repeat(ray, stops.shape[1])
     piece, x, v = np.repeat(np.arange(len(ray)), stops.shape[1]), stops.ravel(), _value(c, stops).ravel()
-    turns = np.abs(v) < close  # too close to tell: fine where f is clearly monotone through it
-    follows = np.concatenate(([False], own[1:] == own[:-1], [False]))
-    before = np.where(follows[:-1], np.roll(v, 1), 0)
-    after = np.where(follows[1:], np.roll(v, -1), 0)
-    through = (np.abs(before) >= close) & (np.abs(after) >= close) & (before * after < 0)
+    turns = np.abs(v) < close  # too close to tell: fine at ends of pieces where f clearly passes through
+    through = _nearest(~turns, own, v) * _nearest(~turns[::-1], own[::-1], v[::-1])[::-1] < 0
     undecided = np.full(rays, np.inf)
     doubt = turns & ((np.abs(x) < 1) | ~through)
     np.minimum.at(undecided, own[doubt], np.abs(v[doubt]))
@@ -151,6 +164,12 @@ def _between(rays: int, ray, low, high, c, stops, close: float) -> list[Truth]:
     t = _bisected(c, low, high, (piece[start], x[start]), (piece[end], x[end]), v[start])
     found = np.split(t, np.searchsorted(own[start], np.arange(1, rays)))
     return [Truth(*one) for one in zip(found, undecided.tolist(), strict=True)]
+
+
+def _nearest(clear: np.ndarray, own: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """At every stop the value of the last clear one up to it, of the same ray; 0 where there is none."""
+    last = np.maximum.accumulate(np.where(clear, np.arange(len(v)), -1))
+    return np.where((last >= 0) & (own[last] == own), v[last], 0)
 
 
 def _bisected(c, low, high, start: tuple[np.ndarray, ...], end: tuple[np.ndarray, ...], sign: np.ndarray) -> np.ndarray:
@@ -168,13 +187,13 @@ def _bisected(c, low, high, start: tuple[np.ndarray, ...], end: tuple[np.ndarray
     return (low[p] + (high[p] - low[p]) * (a + 1).astype(np.longdouble) / 2).astype(np.float64)
 
 
-def judged(truth: Sequence[Truth], t: np.ndarray, tolerance: float) -> dict[str, int]:
+def judged(truth: Sequence[Truth], t: np.ndarray, tolerance: float | np.ndarray) -> dict[str, int]:
     """Of hits t (R, k), ∞ where none: how many are missed, invented, out of place; and rays that are undecided.
 
-    Of fewer than all hits, k in all, the first ones count.
+    Of fewer than all hits, k in all, the first ones count. The tolerance is one, or one for every ray.
     """
     count = {"rays": len(truth), "hits": 0, "undecided": 0, "missed": 0, "invented": 0, "misplaced": 0}
-    for one, hits in zip(truth, t, strict=True):
+    for one, hits, allowed in zip(truth, t, np.broadcast_to(tolerance, len(truth)), strict=True):
         if one.undecided < np.inf:
             count["undecided"] += 1
             continue
@@ -184,5 +203,5 @@ def judged(truth: Sequence[Truth], t: np.ndarray, tolerance: float) -> dict[str,
         count["missed"] += max(len(expected) - len(hits), 0)
         count["invented"] += max(len(hits) - len(expected), 0)
         if len(hits) == len(expected):
-            count["misplaced"] += int((np.abs(hits - expected) > tolerance).sum())
+            count["misplaced"] += int((np.abs(hits - expected) > allowed).sum())
     return count

@@ -249,6 +249,22 @@ def test_a_crossing_at_a_knot_is_one_hit(name):
         assert float((t[:, 0] - (level - origins[:, 0])).abs().max()) < 1e-14 * 8
 
 
+@pytest.mark.parametrize("method", [m for m in TENSOR_PRODUCTS if m != "trilinear"])
+def test_a_crossing_where_cells_meet_is_one_hit(method):
+    """Rays through a corner of cells, not exactly, at its level: pieces no longer than rounding held several roots."""
+    rng = np.random.default_rng(0)
+    samples = rng.random(SIZE[::-1])
+    f = ray_oracle.Sum(method, samples, "mirror")
+    aim, directions = np.array([3.0, 2.0, 2.0]) + f.knots, rng.normal(size=(40, 3))
+    level = float(f(aim[None])[0])
+    truth = ray_oracle.crossings(f, aim - 16 * directions, directions, level)
+    surface = LevelSet(fl.reconstruct(torch.from_numpy(samples), method), level)
+    hits = surface.hits(torch.from_numpy(aim - 16 * directions), torch.from_numpy(directions), 40).t
+    verdict = ray_oracle.judged(truth, hits.numpy(), 1e-9)
+    assert verdict["missed"] == verdict["invented"] == verdict["misplaced"] == 0, verdict
+    assert verdict["undecided"] < 10 < verdict["hits"]
+
+
 def test_a_stretch_on_the_level_hits_where_it_begins():
     samples = torch.ones(8, 8, 8, dtype=torch.float64)
     samples[:, :, 3:] = 0

@@ -22,7 +22,7 @@ with the symmetry of the octahedra and these supports, the one that is C¹ and r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from itertools import product
 
@@ -30,11 +30,13 @@ import torch
 from torch import Tensor
 
 from filterlab.bernstein import Index, multi_indices
+from filterlab.fields.determining import Determining, moved
 from filterlab.fields.tetrahedral import Mask, Shape, Spline, Vector, weighted
 
+Centre = tuple[int, int, int]
 Weights = tuple[int, int, int, int]
 
-_CENTRES = ((0, 0, 0), (2, 0, 0), (1, 1, 1), (1, 1, -1))
+_CENTRES: tuple[Centre, ...] = ((0, 0, 0), (2, 0, 0), (1, 1, 1), (1, 1, -1))
 """c_0 … c_3 of the tetrahedra in the cone."""
 
 _SQUARE, _HEXAGON, _END = (4, 4, 0, 0), (4, 0, 4, 0), (2, 2, 2, 2)
@@ -50,6 +52,11 @@ _KINDS: tuple[tuple[Weights, Weights, Weights], ...] = (
 _SIGNS = tuple(product((-1, 1), repeat=3))
 
 
+def _half(s: tuple[int, ...]) -> Vector:
+    x, y, z = (Fraction(n, 2) for n in s)
+    return x, y, z
+
+
 def _vertex(weights: Weights) -> Vector:
     """v = Σ_k w_k c_k."""
     x, y, z = (
@@ -58,26 +65,36 @@ def _vertex(weights: Weights) -> Vector:
     return x, y, z
 
 
-def _shape(kind: Sequence[Weights]) -> Shape:
-    weights = ((8, 0, 0, 0), *kind)
-    v = [_vertex(w) for w in weights]
-    return Shape((v[0], v[1], v[2], v[3]), {alpha: _mask(alpha, weights, v) for alpha in multi_indices(2, 3)})
+_F: Mask = {_half(s): Fraction(1, 8) for s in _SIGNS}
+_G: tuple[Mask, ...] = tuple({_half(s): Fraction(s[axis], 4) for s in _SIGNS} for axis in range(3))
+"""Value and gradient at a centre."""
+
+Jets = Mapping[tuple[Centre, int], Fraction]
+"""A centre, and which of (f, g) there -> its weight."""
 
 
-def _mask(alpha: Index, weights: Sequence[Weights], vertices: Sequence[Vector]) -> Mask:
+def _linear(c: Centre, v: Vector) -> Jets:
+    """T((c + v) / 2) = f + g · (v − c) / 2."""
+    return {(c, 0): Fraction(1), **{(c, 1 + i): (v[i] - c[i]) / 2 for i in range(3)}}
+
+
+def _rule(alpha: Index, weights: Sequence[Weights], vertices: Sequence[Vector]) -> Jets:
     """Σ_k w_ik T_k((c_k + v_j) / 2)."""
     i, j = (n for n, power in enumerate(alpha) for _ in range(power))
     return weighted(*((Fraction(w, 8), _linear(c, vertices[j])) for w, c in zip(weights[i], _CENTRES, strict=True)))
 
 
-def _linear(c: tuple[int, int, int], v: Vector) -> Mask:
-    """T((c + v) / 2): the sample c + s / 2 has the weight (1 + s · (v − c)) / 8."""
-    return {_around(c, s): sum((n * (a - b) for n, a, b in zip(s, v, c, strict=True)), Fraction(1)) / 8 for s in _SIGNS}
+def _mask(jets: Jets) -> Mask:
+    """Of samples, from that of jets."""
+    return weighted(*((weight, moved((_F, *_G)[n], c)) for (c, n), weight in jets.items()))
 
 
-def _around(c: tuple[int, int, int], s: tuple[int, ...]) -> Vector:
-    x, y, z = (a + Fraction(n, 2) for a, n in zip(c, s, strict=True))
-    return x, y, z
+def _of_kind(kind: Sequence[Weights]) -> tuple[Shape, dict[Index, Jets]]:
+    """A tetrahedron of the cone, and the rules by which its coefficients follow from jets."""
+    weights = ((8, 0, 0, 0), *kind)
+    v = [_vertex(w) for w in weights]
+    rules = {alpha: _rule(alpha, weights, v) for alpha in multi_indices(2, 3)}
+    return Shape((v[0], v[1], v[2], v[3]), {alpha: _mask(jets) for alpha, jets in rules.items()}), rules
 
 
 def _octahedra(x: Tensor) -> Tensor:
@@ -87,4 +104,10 @@ def _octahedra(x: Tensor) -> Tensor:
     return torch.where((y - even).abs().sum(-1, keepdim=True) <= 1.5, even, odd)
 
 
-QUADRATIC_C1 = Spline("quadratic-c1", 2, tuple(map(_shape, _KINDS)), _octahedra, Fraction(1, 2), 2, _CENTRES, 2)
+_SHAPES, _RULES = zip(*map(_of_kind, _KINDS), strict=True)
+
+QUADRATIC_C1 = Spline("quadratic-c1", 2, _SHAPES, _octahedra, Fraction(1, 2), 2, _CENTRES, 2)
+"""Quadratic splines, C¹ everywhere."""
+
+JETS = Determining.of_rows(QUADRATIC_C1, (_F, *_G), _RULES)
+"""Value and gradient at the centres of octahedra: four numbers for every four samples."""

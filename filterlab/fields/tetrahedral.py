@@ -19,7 +19,7 @@ over points.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
@@ -45,9 +45,12 @@ Mask = Mapping[Vector, Fraction]
 """Where samples lie, relative to the centre of a cell -> their weights."""
 
 
-def weighted(*parts: tuple[Fraction, Mask]) -> Mask:
+Key = TypeVar("Key", bound=Hashable)
+
+
+def weighted(*parts: tuple[Fraction, Mapping[Key, Fraction]]) -> dict[Key, Fraction]:
     """Σ factor · mask, without the samples whose weights cancel."""
-    total: dict[Vector, Fraction] = {}
+    total: dict[Key, Fraction] = {}
     for factor, mask in parts:
         for sample, weight in mask.items():
             total[sample] = total.get(sample, Fraction(0)) + factor * weight
@@ -559,14 +562,14 @@ class JetOnTetrahedra:
         if entry is not None:
             index = index + entry * math.prod(self.values.shape[2:])
         samples = flat.index_select(1, index.reshape(-1)).reshape(len(flat), *index.shape).to(points.dtype)
-        rows = torch.cat(self._jet(self.coefficients(samples, at), at), 1)
+        rows = torch.cat(self.rows(self.coefficients(samples, at), at), 1)
         # NaN where a coordinate is, and its derivative by that one; no other has any, nor do the samples
         poison = (voxels * torch.where(unknown, torch.nan, 0.0)).sum(-1).to(rows.dtype)
         return torch.where(unknown.any(-1), 0.0, rows) + poison
 
     def coefficients(self, samples: Tensor, at: Located) -> Tensor:
         """(C, K, P) to the Bernstein coefficients (C, B, P) of every point's own shape."""
-        found = _product(self.tables.masks, samples)
+        found = product_of(self.tables.masks, samples)
         if at.shape is None:
             return found
         row = self.tables.rows.index_select(1, at.shape)
@@ -574,10 +577,10 @@ class JetOnTetrahedra:
 
     def _derivatives(self, order: int, coefficients: Tensor, at: Located) -> Tensor:
         """(C, B_r, P) to the rows (C, J, P) of that order along the axes of the cone."""
-        found = _product(self.tables.derivatives[order], coefficients)
+        found = product_of(self.tables.derivatives[order], coefficients)
         return _of_shape(found.unflatten(1, (len(self.spline.shapes), -1)).transpose(0, 1), at.shape)
 
-    def _jet(self, coefficients: Tensor, at: Located) -> list[Tensor]:
+    def rows(self, coefficients: Tensor, at: Located) -> list[Tensor]:
         """Rows (C, ·, P) of each order, of Bernstein coefficients (C, B, P)."""
         degree, rows = self.spline.degree, []
         pieces = coefficients.movedim(1, -1)
@@ -590,7 +593,7 @@ class JetOnTetrahedra:
         return rows[::-1]
 
 
-def _product(matrix: Tensor, columns: Tensor) -> Tensor:
+def product_of(matrix: Tensor, columns: Tensor) -> Tensor:
     """(R, Q) times (C, Q, P): (C, R, P). What a point gets depends on no other point: BLAS does not promise that."""
     matrix = matrix.to(columns.dtype)
     total = matrix[:, 0, None] * columns[:, 0, None]

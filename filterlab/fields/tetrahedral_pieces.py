@@ -77,14 +77,14 @@ class FieldOnTetrahedra(GridField):
 
     scheme: OnTetrahedra
     _kept: tuple[int, Bounds] | None
-    _jet: JetOnTetrahedra
+    evaluated: JetOnTetrahedra
 
     def _settle(self) -> None:
         super()._settle()
         self._kept = None  # a copy has other coefficients
         values = self.coefficients.values
         own = replace(self.coefficients, values=values if self.channels is not None else values[None, None])
-        self._jet = self.scheme.everywhere(own, self.placement, 0)
+        self.evaluated = self.scheme.everywhere(own, self.placement, 0)
 
     @property
     def degree_along_rays(self) -> int | None:
@@ -134,7 +134,7 @@ class FieldOnTetrahedra(GridField):
         line, near, far = _cut(every, lines.near, lines.far, self._outer(lines))
         cells = self._cells(lines, line, near, far)
         if level is not None:
-            keep = self._may_hold(cells, level, dtype)
+            keep = self.may_hold(cells, level, dtype)
             line, near, far, cells = (x[keep] for x in (line, near, far, cells))
         line, near, far = _cut(line, near, far, self._inner(lines, line, cells))
         coefficients = self._restricted(lines, line, near, far, dtype)
@@ -174,7 +174,7 @@ class FieldOnTetrahedra(GridField):
         spline, parts = self.scheme.spline, []
         for part in torch.arange(len(line), device=line.device).split(CHUNK):
             own, a, b = lines.chosen(line[part]), near[part], far[part]
-            at = locate(spline, self._jet.tables, own.at((a + b) / 2), dtype)
+            at = locate(spline, self.evaluated.tables, own.at((a + b) / 2), dtype)
             coefficients = self._bernstein(at, dtype)
             ends = (self._barycentric(at, own.at(s), dtype) for s in (a, b))
             parts.append(bernstein.restrict(coefficients, *ends))
@@ -183,14 +183,14 @@ class FieldOnTetrahedra(GridField):
     def _barycentric(self, at: Located, voxels: Tensor, dtype: torch.dtype) -> Tensor:
         """(P, 4) of other points of the same tetrahedra."""
         local = (voxels - (at.cell.T + float(self.scheme.spline.shift))).T * at.sign
-        rows = self._jet.tables.barycentric  # (S, 4, 4)
+        rows = self.evaluated.tables.barycentric  # (S, 4, 4)
         own = rows[0].expand(len(voxels), 4, 4) if at.shape is None else rows[at.shape]
         place = local.gather(0, at.axes).T
         return (own[..., 0] + (own[..., 1:] * place[:, None]).sum(-1)).to(dtype)
 
     def _bernstein(self, at: Located, dtype: torch.dtype) -> Tensor:
         """(P, B) coefficients of tetrahedra."""
-        jet, values = self._jet, self.coefficients.values.detach()
+        jet, values = self.evaluated, self.coefficients.values.detach()
         index = jet.folding.flat(jet.tables, at)
         samples = values.reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
         samples = self._decoded_samples(samples, dtype)
@@ -203,7 +203,7 @@ class FieldOnTetrahedra(GridField):
 
     # --- bounds ---
 
-    def _may_hold(self, cells: Tensor, level: float, dtype: torch.dtype) -> Tensor:
+    def may_hold(self, cells: Tensor, level: float, dtype: torch.dtype) -> Tensor:
         """Which cells (P, 3) may hold a level: the samples of one, widened by the norm of the spline, straddle it."""
         low, high, first = self._bounds()
         x, y, z = (cells - first).long().unbind(-1)
@@ -226,12 +226,12 @@ class FieldOnTetrahedra(GridField):
         spline = self.scheme.spline
         reach = [int(spline.shift + s * max(abs(c) for o in spline.samples for c in o)) for s in (-1, 1)]
         first, window = -spline.period, reach[1] - reach[0] + 1
-        every = self._samples(first + reach[0], [n + spline.period + reach[1] for n in self.coefficients.size])
+        every = self.samples_between(first + reach[0], [n + spline.period + reach[1] for n in self.coefficients.size])
         return -_pooled(-every, window), _pooled(every, window), first
 
-    def _samples(self, first: int, last: list[int]) -> Tensor:
+    def samples_between(self, first: int, last: list[int]) -> Tensor:
         """(D, H, W) float64, the samples from `first` to `last` along x, y, z, under the boundary."""
-        folding, flat = self._jet.folding, self.coefficients.values.detach().reshape(-1)
+        folding, flat = self.evaluated.folding, self.coefficients.values.detach().reshape(-1)
         x, y, z = (
             folding.lookup[int(zero) + first : int(zero) + n + 1] for zero, n in zip(folding.zero, last, strict=True)
         )
@@ -246,7 +246,7 @@ class FieldOnTetrahedra(GridField):
         cells = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         if spline.period == 2:  # of one octahedron for every four voxels
             cells = cells[(cells % 2 == cells[:, :1] % 2).all(-1)]
-        cells = cells[self._may_hold(cells, level, torch.float64)]
+        cells = cells[self.may_hold(cells, level, torch.float64)]
         total, held = 0, torch.zeros(len(cells), dtype=torch.bool, device=device)
         for part in torch.arange(len(cells), device=device).split(CHUNK):
             for which in spline.tetrahedra:

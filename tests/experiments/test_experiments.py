@@ -248,6 +248,28 @@ def tiny(name, scan):
             },
         ]
     }
+    configs["tetrahedral_table"] = {
+        "sources": [
+            {
+                "title": "a signal",
+                "signal": "torus",
+                "resolution": 8,
+                "level": 0,
+                "zoom": {"title": "the middle", "window": [0.25, 0.25, 0.75, 0.75]},
+            },
+            {
+                "title": "no scan",
+                "volume": {"file": "not_here.nrrd", "optional": True},
+                "level": 120,
+                "zoom": {"title": "the middle", "window": [0.25, 0.25, 0.75, 0.75]},
+            },
+        ],
+        "methods": ["qss", "cubic-c1", "quadratic-c1"],
+        "sizes": [[24, 20]],
+        "scale": 0.5,
+        "points": 20,
+        "seconds": 0,
+    }
     parts = {n: {"experiment": n, "description": f"tiny {n}", **c} for n, c in configs.items()}
     parts["demo"] = {"experiment": "demo", "description": "tiny", "sections": [parts["rms_error"], parts["dvr_volume"]]}
     if name not in parts:
