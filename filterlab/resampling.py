@@ -94,7 +94,7 @@ def _target(
     affine[:3, :3] = direction * new
     affine[:3, 3] = center - affine[:3, :3] @ ((size - 1) / 2)
     w, h, d = (int(n) for n in size)
-    return (d, h, w), Geometry.of(affine=affine)
+    return (d, h, w), Geometry.of(affine=affine, world=volume.world)
 
 
 def _separable(

@@ -9,6 +9,7 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 import torch
@@ -185,7 +186,7 @@ def test_info(capsys: pytest.CaptureFixture[str], volume_file: Path) -> None:
     assert (found["spacing"], found["origin"], found["extent"]) == ("1 2 3", "10 20 30", "6 10 12")
     assert found["range"] == f"{samples.min()} … {samples.max()}"
     assert found["mean"] == f"{samples.double().mean():.6g}"
-    assert found["world axes"] == "RAS"
+    assert found["world axes"] == "not declared"
     assert main(["info", str(volume_file), "--header-only"]) == 0
     assert "range" not in facts(capsys.readouterr().out)
 
@@ -219,6 +220,78 @@ def test_info_shows_a_rotated_affine_and_odd_names(capsys: pytest.CaptureFixture
     printed = capsys.readouterr().out
     assert facts(printed)["affine"] == "0 -1 0 5"
     assert "[red]a.npz" in printed
+
+
+@pytest.fixture
+def series_file(tmp_path: Path) -> Path:
+    """Two frames of three channels each, in a NIfTI file."""
+    path = tmp_path / "series.nii"
+    samples = np.random.default_rng(0).integers(0, 100, (6, 5, 4, 2, 3)).astype(np.int16)
+    image = nibabel.Nifti1Image(samples, np.diag([1.0, 2, 3, 1]))
+    image.header.set_xyzt_units("mm", "sec")
+    nibabel.save(image, path)
+    return path
+
+
+def test_info_shows_every_header(capsys: pytest.CaptureFixture[str], series_file: Path) -> None:
+    assert main(["info", str(series_file)]) == 0
+    printed = capsys.readouterr()
+    found = facts(printed.out)
+    assert (found["frames"], found["channels"], found["size (x, y, z)"]) == ("2", "3", "6 × 5 × 4")
+    assert found["codes"] == "NIfTI-1, sform 2, qform 0, time in sec"
+    assert (found["world axes"], found["unit"]) == ("RAS", "mm")
+    assert "range" not in found
+    assert "no voxels are read" in printed.err
+    assert "a choice among its 2 frames, frame=0 to frame=1" in printed.err
+    assert main(["info", str(series_file), "--frame", "1", "--channel", "2"]) == 0
+    printed = capsys.readouterr()
+    found, samples = facts(printed.out), load_volume(series_file, frame=1, channel=2).samples
+    assert (found["frames"], found["channels"]) == ("2; this is 1", "3; this is 2")
+    assert found["range"] == f"{samples.min()} … {samples.max()}"
+    assert printed.err == ""
+    fails(capsys, ["info", series_file, "--frame", "2"], 1, "a frame from 0 to 1; got frame 2")
+
+
+def test_frames_and_channels_are_chosen_everywhere(
+    capsys: pytest.CaptureFixture[str], series_file: Path, tmp_path: Path
+) -> None:
+    part, out = ["--frame", "1", "--channel", "2"], tmp_path / "out.nrrd"
+    expected = load_volume(series_file, frame=1, channel=2)
+    line = ["resample", str(series_file), "-o", str(out), "--shape", "6", "5", "4"]
+    assert main([*line, *part]) == 0
+    assert torch.equal(load_volume(out).samples, resample(expected, shape=(4, 5, 6)).samples)
+    fails(capsys, line, 1, "a choice among its 2 frames")
+    surface = [str(series_file), "--level", "50", "-o", str(tmp_path / "a.png"), "--size", "12", "8"]
+    save_volume(expected, tmp_path / "one.nii")
+    assert main(["render", *surface, *part]) == 0
+    assert main(["render", str(tmp_path / "one.nii"), *surface[1:3], "-o", str(tmp_path / "b.png"), *surface[5:]]) == 0
+    assert torch.equal(load_image(tmp_path / "a.png"), load_image(tmp_path / "b.png"))
+    fails(capsys, ["render", *surface], 1, "a choice among its 2 frames")
+    scene = tmp_path / "scene.yaml"
+    for volume in (series_file.name, f"{{file: {series_file.name}, channel: 0}}"):
+        scene.write_text(f"volume: {volume}\nsurface: {{level: 50}}\n")
+        assert main(["mesh", str(scene), "-o", str(tmp_path / "a.ply"), *part]) == 0
+    assert main(["mesh", str(tmp_path / "one.nii"), "--level", "50", "-o", str(tmp_path / "b.ply")]) == 0
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    capsys.readouterr()
+    recommended = ["recommend", str(series_file), "--max-error", "50%", "-o", str(tmp_path / "found.yaml")]
+    assert main([*recommended, *part]) == 0
+    text = (tmp_path / "found.yaml").read_text()
+    assert "frame: 1" in text
+    assert "channel: 2" in text
+    capsys.readouterr()
+    fails(capsys, recommended, 1, "a choice among its 2 frames")
+
+
+def test_what_is_odd_about_a_file_is_told_in_a_line(
+    capsys: pytest.CaptureFixture[str], series_file: Path, tmp_path: Path
+) -> None:
+    series_file.write_bytes(series_file.read_bytes() + b"more")
+    for command in (["info", str(series_file)], ["resample", str(series_file), "-o", "out.npy", "--shape", *"222"]):
+        command = [str(tmp_path / a) if a == "out.npy" else a for a in command]
+        assert main([*command, "--frame", "0", "--channel", "0"]) == 0
+        told = f"filterlab: {series_file}: passed over what comes behind its 1440 bytes of samples\n"
+        assert capsys.readouterr().err == told
 
 
 def test_info_of_a_damaged_file(capsys: pytest.CaptureFixture[str], volume_file: Path) -> None:
