@@ -196,6 +196,7 @@ class Resample:
       filterlab resample engine.nrrd -o small.nii.gz --shape 128 128 64 --dtype input
       filterlab resample pet.nii.gz -o pet_on_ct.nii.gz --like ct.nii.gz --boundary border
       filterlab resample cells.ome.tif -o nuclei.nrrd --channel 1 --frame 0 --spacing 0.2 0.2 0.2
+      filterlab resample organs.nii.gz -o organs_on_ct.nii.gz --like ct.nii.gz --labels
     """
 
     input: Annotated[Positional[Path], arg(metavar="IN")]
@@ -218,8 +219,11 @@ class Resample:
     """Which volume of a time series (or entry of a batch), from 0."""
     channel: Channel = None
     """Which of several values per voxel, from 0: components of vectors, colours, dyes."""
-    dtype: str = "float32"
-    """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN."""
+    labels: bool = False
+    """The values of IN are names, not amounts: of each the method reconstructs where it is, and the strongest wins."""
+    dtype: str | None = None
+    """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN.
+    Default: `input` for labels and for the method nearest, else float32, or float64 if that is what the values need."""
     nifti2: bool = False
     """Write NIfTI-2, which fewer tools open; NIfTI-1 rounds numbers of the affine, by 6e-8 of themselves at most."""
     max_gigabytes: float = 8.0
@@ -238,6 +242,7 @@ class Resample:
             if path is not None:
                 _check_not_input(self.output, path)
 
+        import numpy as np
         import torch
 
         from filterlab.io.volumes import check_saveable, describe, load_volume, save_volume
@@ -252,18 +257,23 @@ class Resample:
         source = describe(self.input, frame=self.frame, channel=self.channel)
         source.check_choice()
         target = None if self.like is None else describe(self.like)
-        dtype = _result_type(self.dtype, source)
-        working = torch.float64 if torch.float64 in (dtype, source.dtype) else torch.float32
+        keeps = self.labels or self.method == "nearest"
+        stored = _result_type(self.dtype or ("input" if keeps else None), source)
+        working = _working_type(stored, source)
         check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)
         limit = _limit(self.max_gigabytes)
         shape = [*source.shape[:-3], *self._new_size(source, target)]
-        _check_memory(shape, max(working.itemsize, dtype.itemsize), limit)
+        itemsize = max(working.itemsize, source.dtype.itemsize if keeps else 0, np.dtype(stored or "float32").itemsize)
+        _check_memory(shape, itemsize, limit)
         volume = load_volume(self.input, frame=self.frame, channel=self.channel, max_bytes=limit)
         grid: dict = {"spacing": self.spacing} if self.spacing else {"shape": self.shape[::-1] if self.shape else None}
         if target is not None:  # a grid without samples: one voxel, shown over and over
             grid = {"like": Volume.with_geometry(torch.zeros(()).expand(target.shape[-3:]), target.geometry)}
-        result = resample(volume, self.method, boundary=self.boundary, dtype=working, nan=self.nan, **grid)
-        save_volume(_converted(result, dtype), self.output, nifti2=self.nifti2)
+        if not keeps:
+            _tell_labels(volume, source, self.input)
+        asked = {"dtype": None if keeps or stored is None else working, "labels": self.labels}
+        result = resample(volume, self.method, boundary=self.boundary, nan=self.nan, **asked, **grid)
+        save_volume(_converted(result, stored), self.output, stored=stored, nifti2=self.nifti2)
         _tell_rounding(result, self.output, self.nifti2)
 
     def _new_size(self, source: VolumeHeader, target: VolumeHeader | None) -> list[float]:
@@ -751,12 +761,38 @@ def _check_device(name: str) -> None:
         ) from None
 
 
-def _result_type(name: str, source: VolumeHeader) -> torch.dtype:
+INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
+
+
+def _result_type(name: str | None, source: VolumeHeader) -> str | None:
+    """The type in the file, by NumPy's name; None: what the values need."""
+    if name is None:
+        return None
+    _check_name("dtype", name, ["float32", "float64", *INTEGERS, "input"])
+    if name != "input":
+        return name
+    if source.dtype.is_floating_point:
+        return str(source.dtype).removeprefix("torch.")
+    return source.stored if source.stored in INTEGERS else "uint8"  # bool
+
+
+def _working_type(stored: str | None, source: VolumeHeader) -> torch.dtype:
+    """What is computed in: float64 where that comes in or goes out, or wide integers do."""
     import torch
 
-    types = {n: getattr(torch, n) for n in ("float32", "float64", "uint8", "int8", "int16", "int32", "int64")}
-    _check_name("dtype", name, [*types, "input"])
-    return source.dtype if name == "input" else types[name]
+    wide = ("float64", "int32", "uint32", "int64", "uint64")
+    if source.dtype == torch.float64 or stored == "float64":
+        return torch.float64
+    return torch.float64 if source.stored in wide and stored != "float32" else torch.float32
+
+
+def _tell_labels(volume: Volume, source: VolumeHeader, path: Path) -> None:
+    """Warns of a volume whose values are likely to be names, between which nothing lies."""
+    from filterlab.labels import look_like_labels
+
+    if source.fields.get("intent") == "labels" or look_like_labels(volume.samples):
+        what = "its values look like labels, and are mixed like amounts; --labels or --method nearest keeps them"
+        print(f"filterlab: {path}: {what}", file=sys.stderr)
 
 
 def _limit(gigabytes: float) -> int:
@@ -804,16 +840,22 @@ def _installed_memory() -> float:
         return math.inf
 
 
-def _converted(volume: Volume, dtype: torch.dtype) -> Volume:
-    """The volume in that type; integers are rounded, and clipped to what the type holds."""
+def _converted(volume: Volume, stored: str | None) -> Volume:
+    """The volume in a type that holds what is stored; integers are rounded, and clipped to what that holds."""
+    import numpy as np
     import torch
 
+    from filterlab.io.bounded import SAMPLE_TYPES
+
+    if stored is None or not volume.dtype.is_floating_point:  # integers are written as they are, or refused
+        return volume
+    dtype = getattr(torch, SAMPLE_TYPES[stored])
     if dtype.is_floating_point:
         return volume.to(dtype)
-    info = torch.iinfo(dtype)
-    samples = volume.samples.round().clamp(info.min, info.max)
-    top = samples >= float(info.max)  # the largest int64 is no float: converting it would wrap round
-    return type(volume).with_geometry(samples.to(dtype).masked_fill(top, info.max), volume.geometry)
+    least, most = int(np.iinfo(stored).min), min(int(np.iinfo(stored).max), torch.iinfo(dtype).max)
+    samples = volume.samples.round().clamp(least, most)
+    top = samples >= float(most)  # the largest int64 is no float: converting it would wrap round
+    return type(volume).with_geometry(samples.to(dtype).masked_fill(top, most), volume.geometry)
 
 
 def _yes(value: bool) -> str:

@@ -386,6 +386,23 @@ def _checked_samples(samples: Tensor) -> Tensor:
     return samples
 
 
+def exact_float(samples: Tensor) -> torch.dtype:
+    """The smallest of float32 and float64 that holds every one of the samples: float64 for integers beyond 2²⁴.
+
+    Raises:
+        ValueError: integers beyond 2⁵³, which no floating type holds.
+    """
+    if samples.dtype not in (torch.int32, torch.int64) or samples.numel() == 0:
+        return torch.promote_types(samples.dtype, torch.float32)
+    least, most = (int(v) for v in samples.aminmax())
+    if max(-least, most) > 2**53:
+        raise ValueError(
+            f"expected integers that float64 holds, up to 2⁵³, to compute with; got {most if most > 2**53 else least} "
+            "(method 'nearest' and labels=True keep any)"
+        )
+    return torch.float64 if max(-least, most) > 2**24 else torch.float32
+
+
 def as_volume(volume: Volume | Tensor) -> Volume:
     """A `Volume` as it is; a bare tensor with voxel centres at the integers. Raises TypeError for anything else."""
     if not isinstance(volume, Volume | Tensor):

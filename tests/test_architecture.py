@@ -33,6 +33,7 @@ FLOORS = {
     "signals": 4,
     "methods": 4,
     "surfaces": 4,
+    "labels": 4,
     "resampling": 5,
     "spectrum": 5,
     "costs": 5,

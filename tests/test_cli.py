@@ -10,13 +10,14 @@ from importlib.metadata import version
 from pathlib import Path
 
 import nibabel
+import nrrd
 import numpy as np
 import pytest
 import torch
 
 from filterlab import METHODS, Volume, load_volume, resample, save_volume, signals
 from filterlab.cli import UsageError, main, split_overrides
-from filterlab.io import load_image
+from filterlab.io import describe, load_image
 
 SCENE = """
 signal: {name: marschner-lobb, samples: 12}
@@ -377,6 +378,64 @@ def test_resample_to_integers_rounds_and_clips(tmp_path: Path) -> None:
         line = ["resample", str(tmp_path / "big.nrrd"), "-o", str(tmp_path / "out.nrrd"), "--shape", *"211"]
         assert main([*line, "--dtype", dtype]) == 0
         assert (load_volume(tmp_path / "out.nrrd").samples == torch.iinfo(getattr(torch, dtype)).max).all()
+
+
+@pytest.fixture
+def label_file(tmp_path: Path) -> Path:
+    """Balls of the labels 0, 2, 4 in uint16."""
+    z, y, x = np.indices((12, 12, 12)) - 5.5
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    samples = np.select([radius < 2.5, radius < 4.5], [4, 2], 0).astype(np.uint16)
+    nrrd.write(str(tmp_path / "labels.nrrd"), samples, index_order="C")
+    return tmp_path / "labels.nrrd"
+
+
+@pytest.mark.parametrize("how", [["--labels"], ["--labels", "--method", "notch"], ["--method", "nearest"]])
+def test_labels_stay_labels(capsys: pytest.CaptureFixture[str], label_file: Path, tmp_path: Path, how: list) -> None:
+    out = tmp_path / "out.nrrd"
+    line = ["resample", str(label_file), "-o", str(out), "--shape", "19", "18", "17"]
+    assert main(line) == 0
+    assert "labels.nrrd: its values look like labels" in capsys.readouterr().err
+    assert len(load_volume(out).samples.unique()) > 100
+    assert main([*line, *how]) == 0
+    assert capsys.readouterr().err == ""
+    assert load_volume(out).samples.unique().tolist() == [0, 2, 4]
+    assert describe(out).stored == "uint16"
+    method = how[-1] if "--method" in how else "triquadratic"
+    expected = resample(load_volume(label_file), method, shape=(17, 18, 19), labels="--labels" in how)
+    assert torch.equal(load_volume(out).samples, expected.samples)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int8, np.uint16, np.int16, np.uint32, np.int32, np.uint64, np.int64])
+@pytest.mark.parametrize("method", ["nearest", "trilinear"])
+def test_integers_come_out_as_they_went_in(tmp_path: Path, dtype: type, method: str) -> None:
+    """To the last digit, in their own type; what float64 cannot hold, and is computed with, is refused."""
+    info, out = np.iinfo(dtype), tmp_path / "out.nrrd"
+    largest = min(info.max, 2**63 - 1)
+    for top in {largest, min(largest, 2**53), min(largest, 16_777_217)}:
+        samples = np.array([[[info.min, 0, 1, top]]]) if info.min > -(2**53) else np.array([[[-5, 0, 1, top]]])
+        nrrd.write(str(tmp_path / "in.nrrd"), samples.astype(dtype), index_order="C")
+        line = ["resample", str(tmp_path / "in.nrrd"), "-o", str(out), "--shape", "4", "1", "1", "--method", method]
+        code = main([*line, "--dtype", "input"])
+        assert code == (1 if method == "trilinear" and top > 2**53 else 0)
+        if code == 0:
+            assert describe(out).stored == np.dtype(dtype).name
+            assert load_volume(out).samples.tolist() == samples.tolist()
+        if code == 0 and method == "trilinear" and top > 2**24:
+            assert main(line) == 0
+            assert describe(out).stored == "float64"
+            assert load_volume(out).samples.tolist() == samples.tolist()
+            assert main([*line, "--dtype", "float32"]) == 1
+
+
+def test_results_are_rounded_and_clipped_to_every_integer_type(tmp_path: Path) -> None:
+    save_volume(Volume(torch.tensor([[[-1e30, -1.4, 0.6, 1e30]]])), tmp_path / "in.nrrd")
+    line = ["resample", str(tmp_path / "in.nrrd"), "-o", str(tmp_path / "out.nrrd"), "--shape", "4", "1", "1"]
+    for name in ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64"):
+        assert main([*line, "--method", "nearest", "--dtype", name]) == 0
+        least, most = np.iinfo(name).min, min(np.iinfo(name).max, 2**63 - 1)
+        assert load_volume(tmp_path / "out.nrrd").samples.tolist() == [[[least, max(least, -1), 1, most]]]
+        assert describe(tmp_path / "out.nrrd").stored == name
 
 
 def test_resample_refuses_before_it_works(
