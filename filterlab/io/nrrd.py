@@ -1,9 +1,9 @@
 """NRRD volumes (`.nrrd`, or `.nhdr` with a data file beside it).
 
-Read: raw, gzip and bzip2 data, attached or in one data file in the same folder or below; both byte orders; geometry
-from `space directions` and `space origin`, or `spacings` (with `axis mins`). Three axes are of space; others, of time
-(kind `time`) or of the components of a voxel (kinds such as `vector`, `RGB-color`, `list`), are chosen from. Written:
-attached gzip data.
+Read: raw, gzip and bzip2 data, attached or in one data file in the same folder or below; both byte orders; data as text
+and behind skipped lines, by SimpleITK (the extra `itk`); geometry from `space directions` and `space origin`, or
+`spacings` (with `axis mins`). Three axes are of space; others, of time (kind `time`) or of the components of a voxel
+(kinds such as `vector`, `RGB-color`, `list`), are chosen from. Written: attached gzip data.
 
 World frame: where the file declares an anatomical space (RAS, LAS, LPS), world coordinates are RAS, as in NIfTI: x to
 the right, y to the front, z to the head of the patient; LPS and LAS are converted. Other spaces are taken as they are.
@@ -15,6 +15,7 @@ Source: the format's definition, https://teem.sourceforge.net/nrrd/format.html
 from __future__ import annotations
 
 import gzip
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from filterlab.io import itk
 from filterlab.io.bounded import (
     MAX_HEADER_BYTES,
     Choice,
@@ -57,6 +59,7 @@ _TYPES = {
 }
 TYPES = {alias: name for name, aliases in _TYPES.items() for alias in aliases}
 _WRITTEN = {name: aliases[-1] for name, aliases in _TYPES.items()}
+_BY_ITK = ("ascii", "text", "txt", "hex")
 ENCODINGS = {"raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2"}
 
 _SHORT = {"ras": "right-anterior-superior", "las": "left-anterior-superior", "lps": "left-posterior-superior"}
@@ -85,8 +88,12 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
     axes = _axes(path, sizes, fields)
     size = tuple(sizes[a] for a in axes.space)
     dtype = _dtype(path, fields)
-    stored = _stored(path, fields, end, sizes[::-1], dtype)
-    stored.check()
+    by_itk = dimension == 3 and _is_exotic(fields)
+    stored = None if by_itk else _stored(path, fields, end, sizes[::-1], dtype)
+    if stored is None:
+        _check_exotic(path, fields, sizes)
+    else:
+        stored.check()
     affine, world = _affine(path, fields, dimension, axes.space, sizes)
     target = sample_dtype(path, dtype)
     choice = Choice.of(path, *axes.counts(sizes), frame, channel)
@@ -97,12 +104,12 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
         size[::-1],
         dtype.name,
         check_geometry(path, affine, world),
-        stored.encoding,
+        fields["encoding"].lower() if stored is None else stored.encoding,
         {k: v for k, v in fields.items() if k not in ("sizes", "dimension", "type", "encoding")},
         target,
         choice,
-        stored.held(at),
-        lambda: as_tensor(path, stored.read(at), target),
+        0 if stored is None else stored.held(at),
+        lambda: as_tensor(path, itk.read_nrrd(path, size[::-1], dtype) if stored is None else stored.read(at), target),
     )
 
 
@@ -192,12 +199,25 @@ def _axes(path: Path, sizes: tuple[int, ...], fields: dict[str, str]) -> Axes:
     return Axes((space[0], space[1], space[2]), next(iter(time), None), next(iter(components), None))
 
 
+def _is_exotic(fields: dict[str, str]) -> bool:
+    """Whether samples are stored in a way that we leave to ITK."""
+    return fields.get("encoding", "").lower() in _BY_ITK or fields.get("line skip", "0") != "0"
+
+
+def _check_exotic(path: Path, fields: dict[str, str], sizes: tuple[int, ...]) -> None:
+    """Raises VolumeFileError where there is no SimpleITK, or data that are not here or cannot hold the samples."""
+    itk.require_simpleitk(path, f"NRRD data of encoding {fields.get('encoding', 'none')[:40]} and line skips")
+    file = beside(path, fields["data file"]) if "data file" in fields else path
+    if (length := file.stat().st_size) < math.prod(sizes) and fields["encoding"].lower() in _BY_ITK:
+        raise VolumeFileError(path, f"{math.prod(sizes)} numbers as text", f"{length} bytes")
+
+
 def _dtype(path: Path, fields: dict[str, str]) -> np.dtype:
     name = " ".join(_required(path, fields, "type").lower().split())
     if name not in TYPES:
         raise VolumeFileError(path, f"a type among {', '.join(_WRITTEN.values())}", repr(name[:40]))
     dtype = np.dtype(TYPES[name])
-    if dtype.itemsize == 1:
+    if dtype.itemsize == 1 or fields.get("encoding", "").lower() in _BY_ITK[:3]:  # text has no order of bytes
         return dtype
     endian = _required(path, fields, "endian").lower()
     if endian not in ("little", "big"):
@@ -208,7 +228,8 @@ def _dtype(path: Path, fields: dict[str, str]) -> np.dtype:
 def _stored(path: Path, fields: dict[str, str], end: int, shape: tuple[int, ...], dtype: np.dtype) -> Stored:
     encoding = ENCODINGS.get(_required(path, fields, "encoding").lower())
     if encoding is None:
-        raise VolumeFileError(path, f"encoding {', '.join(ENCODINGS)}", repr(fields["encoding"][:40]))
+        expected = f"encoding {', '.join(ENCODINGS)} ({', '.join(_BY_ITK)} for three axes)"
+        raise VolumeFileError(path, expected, repr(fields["encoding"][:40]))
     if integer(path, "line skip", fields.get("line skip", "0")) != 0:
         raise VolumeFileError(path, "line skip: 0", fields["line skip"])
     file, offset = path, end

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from filterlab.io import nifti, nrrd, numpy_files, raw, tiff
+from filterlab.io import itk, nifti, nrrd, numpy_files, raw, tiff
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import VolumeFileError, VolumeHeader, beside, regular_file
 from filterlab.io.config import MAX_SIDECAR_BYTES, load_config, unknown_name
@@ -49,6 +49,7 @@ FORMATS: dict[str, VolumeFormat] = {
         VolumeFormat("npy", (".npy",), numpy_files.read_npy_header, numpy_files.write_npy, (".npy",)),
         VolumeFormat("npz", (".npz",), numpy_files.read_npz_header, numpy_files.write_npz, (".npz",)),
         VolumeFormat("raw", (".raw", ".raw.yaml"), raw.read_header),
+        VolumeFormat("ITK", itk.SUFFIXES, itk.read_header),
     )
 }
 
@@ -57,9 +58,12 @@ BATCHED = ("npy", "npz")  # formats that hold (N, C, D, H, W)
 
 
 def format_of(path: Path) -> VolumeFormat:
-    """The format of a file by its ending; a folder is a TIFF stack. Raises VolumeFileError that lists the endings."""
+    """The format of a file by its ending; a folder is a TIFF stack, or a DICOM series.
+
+    Raises VolumeFileError that lists the endings.
+    """
     if path.is_dir():
-        return FORMATS["TIFF"]
+        return FORMATS["ITK" if itk.is_series(path) else "TIFF"]
     name = path.name.lower()
     for known in FORMATS.values():
         if name.endswith(known.endings):
@@ -96,7 +100,9 @@ def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:
     """
     path = Path(path)
     name, found = format_of(path).name, [path]
-    if path.is_dir():
+    if name == "ITK":
+        found = itk.files_of(path)
+    elif path.is_dir():
         found = tiff.slices(path)
     elif name == "npy" and numpy_files.sidecar_of(path).exists():
         found.append(numpy_files.sidecar_of(path))
@@ -133,12 +139,13 @@ def load_volume(
     """The volume in a file (or in a folder of TIFF slices).
 
     Args:
-        path: NRRD, NIfTI, TIFF, .npy, .npz, or .raw with a sidecar (`FORMATS`).
+        path: NRRD, NIfTI, TIFF, .npy, .npz, or .raw with a sidecar, or what SimpleITK reads (`FORMATS`); or the folder
+            of a DICOM series.
         frame: which volume of a time series (or entry of a batch), from 0; needed where there are several.
         channel: which of several values per voxel, from 0: components of vectors, colours, dyes; needed likewise.
         max_bytes: the most that the samples may take in memory; default 8 GiB. Reading takes at most 4 MiB + 2 × the
             file + 3 × `max_bytes` of memory and 1 s + 4 µs × the file + 50 ns × `max_bytes` of one core, whatever the
-            file says (`docs/extremes.md`).
+            file says (`docs/extremes.md`), but for what SimpleITK and the codecs of TIFF read.
 
     Raises:
         FileNotFoundError: there is no such file.
