@@ -14,6 +14,7 @@ import math
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -23,6 +24,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 from tyro.conf import Positional, arg, subcommand
+
+from filterlab.io.warned import VolumeFileWarning
+from filterlab.world import RAS, World
 
 if TYPE_CHECKING:
     import torch
@@ -37,6 +41,8 @@ BINS = 16
 
 Triple = tuple[float, float, float]
 Output = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
+Frame = Annotated[int | None, arg(metavar="T")]
+Channel = Annotated[int | None, arg(metavar="C")]
 
 
 class UsageError(ValueError):
@@ -49,7 +55,8 @@ class Render:
 
     A scene is a YAML file: what is shown, how it is reconstructed, the transfer function or the surface, the camera,
     the lights. Any of its values can be changed on the command line, after the name of the scene, by its path in the
-    file. In place of a scene, a volume file and --level are enough for a surface.
+    file; --frame and --channel choose one of several volumes in a file. In place of a scene, a volume file and --level
+    are enough for a surface.
 
     examples:
       filterlab render engine.yaml -o engine.png
@@ -164,10 +171,12 @@ def _scene(path: Path, overrides: dict[str, str], output: Path | None) -> Scene:
     """The scene in a file; or, with a level among the overrides, that of the surface in a volume."""
     from filterlab.scenes.build import load_scene, surface_scene
 
+    part = {name: overrides.pop(name) for name in ("frame", "channel") if name in overrides}
     level = overrides.pop("level", None)
     if level is None and path.suffix.lower() not in (".yaml", ".yml", "") and path.is_file():
         raise ValueError(f"expected a scene, a .yaml file; for the surface in a volume add --level: {path}")
-    scene = load_scene(path, overrides) if level is None else surface_scene(path, level, overrides)
+    chosen = overrides | {f"volume.{name}": index for name, index in part.items()}
+    scene = load_scene(path, chosen) if level is None else surface_scene(path, level, chosen)
     if scene.volume is not None and output is not None:
         _check_not_input(output, Path(scene.volume.file))
     _check_device(scene.device)
@@ -186,6 +195,8 @@ class Resample:
       filterlab resample engine.nrrd -o fine.nrrd --method notch --spacing 0.5 0.5 0.5
       filterlab resample engine.nrrd -o small.nii.gz --shape 128 128 64 --dtype input
       filterlab resample pet.nii.gz -o pet_on_ct.nii.gz --like ct.nii.gz --boundary border
+      filterlab resample cells.ome.tif -o nuclei.nrrd --channel 1 --frame 0 --spacing 0.2 0.2 0.2
+      filterlab resample organs.nii.gz -o organs_on_ct.nii.gz --like ct.nii.gz --labels
     """
 
     input: Annotated[Positional[Path], arg(metavar="IN")]
@@ -204,8 +215,15 @@ class Resample:
     """How the volume goes on beyond its ends: mirror, reflect, wrap, border or zeros."""
     nan: str = "refuse"
     """What becomes of voxels that are NaN: refuse, propagate (NaN near them) or fill (values from around)."""
-    dtype: str = "float32"
-    """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN."""
+    frame: Frame = None
+    """Which volume of a time series (or entry of a batch), from 0."""
+    channel: Channel = None
+    """Which of several values per voxel, from 0: components of vectors, colours, dyes."""
+    labels: bool = False
+    """The values of IN are names, not amounts: of each the method reconstructs where it is, and the strongest wins."""
+    dtype: str | None = None
+    """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN.
+    Default: `input` for labels and for the method nearest, else float32, or float64 if that is what the values need."""
     nifti2: bool = False
     """Write NIfTI-2, which fewer tools open; NIfTI-1 rounds numbers of the affine, by 6e-8 of themselves at most."""
     max_gigabytes: float = 8.0
@@ -224,6 +242,7 @@ class Resample:
             if path is not None:
                 _check_not_input(self.output, path)
 
+        import numpy as np
         import torch
 
         from filterlab.io.volumes import check_saveable, describe, load_volume, save_volume
@@ -235,20 +254,26 @@ class Resample:
         _check_name("method", self.method, METHODS)
         _check_name("boundary", self.boundary, Boundary)
         _check_name("nan", self.nan, CHOICES)
-        source = describe(self.input)
+        source = describe(self.input, frame=self.frame, channel=self.channel)
+        source.check_choice()
         target = None if self.like is None else describe(self.like)
-        dtype = _result_type(self.dtype, source)
-        working = torch.float64 if torch.float64 in (dtype, source.dtype) else torch.float32
+        keeps = self.labels or self.method == "nearest"
+        stored = _result_type(self.dtype or ("input" if keeps else None), source)
+        working = _working_type(stored, source)
         check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)
         limit = _limit(self.max_gigabytes)
         shape = [*source.shape[:-3], *self._new_size(source, target)]
-        _check_memory(shape, max(working.itemsize, dtype.itemsize), limit)
-        volume = load_volume(self.input, max_bytes=limit)
+        itemsize = max(working.itemsize, source.dtype.itemsize if keeps else 0, np.dtype(stored or "float32").itemsize)
+        _check_memory(shape, itemsize, limit)
+        volume = load_volume(self.input, frame=self.frame, channel=self.channel, max_bytes=limit)
         grid: dict = {"spacing": self.spacing} if self.spacing else {"shape": self.shape[::-1] if self.shape else None}
         if target is not None:  # a grid without samples: one voxel, shown over and over
             grid = {"like": Volume.with_geometry(torch.zeros(()).expand(target.shape[-3:]), target.geometry)}
-        result = resample(volume, self.method, boundary=self.boundary, dtype=working, nan=self.nan, **grid)
-        save_volume(_converted(result, dtype), self.output, nifti2=self.nifti2)
+        if not keeps:
+            _tell_labels(volume, source, self.input)
+        asked = {"dtype": None if keeps or stored is None else working, "labels": self.labels}
+        result = resample(volume, self.method, boundary=self.boundary, nan=self.nan, **asked, **grid)
+        save_volume(_converted(result, stored), self.output, stored=stored, nifti2=self.nifti2)
         _tell_rounding(result, self.output, self.nifti2)
 
     def _new_size(self, source: VolumeHeader, target: VolumeHeader | None) -> list[float]:
@@ -387,12 +412,17 @@ class Info:
     examples:
       filterlab info engine.nrrd
       filterlab info scan.nii.gz --header-only
+      filterlab info series.nii.gz --frame 3
     """
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """The volume: a file, or a folder of numbered TIFF slices."""
     header_only: Annotated[bool, arg(aliases=["-H"])] = False
     """Do not read the voxels."""
+    frame: Frame = None
+    """Which volume of a time series (or entry of a batch), from 0."""
+    channel: Channel = None
+    """Which of several values per voxel, from 0."""
 
     def run(self, overrides: dict[str, str]) -> None:
         from rich.table import Table
@@ -400,14 +430,15 @@ class Info:
 
         from filterlab.io.volumes import describe, load_volume
 
-        header = describe(self.file)
+        header = describe(self.file, frame=self.frame, channel=self.channel)
         table = Table(show_header=False, box=None)
         for name, value in _described(header):
             table.add_row(name, Text(value))
         _show(table)
-        if not self.header_only:
+        if not self.header_only and _tell_open_choice(header):
             table = Table(show_header=False, box=None)
-            for name, value in _distribution(load_volume(self.file).samples):
+            volume = load_volume(self.file, frame=self.frame, channel=self.channel)
+            for name, value in _distribution(volume.samples):
                 table.add_row(name, Text(value))
             _show(table)
 
@@ -439,6 +470,10 @@ class Recommend:
     """How the volume goes on beyond its ends: mirror, reflect, wrap, border or zeros."""
     nan: str = "refuse"
     """What becomes of voxels that are NaN: refuse, propagate or fill."""
+    frame: Frame = None
+    """Which volume of a time series (or entry of a batch), from 0."""
+    channel: Channel = None
+    """Which of several values per voxel, from 0."""
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="SCENE.yaml")] = None
     """A scene to write, for `filterlab render`."""
     json: bool = False
@@ -467,10 +502,14 @@ class Recommend:
             ("nan", self.nan, CHOICES),
         ):
             _check_name(what, name, known)
-        if self.output is not None and len(shape := describe(self.volume).shape) != 3:
+        part = {"frame": self.frame, "channel": self.channel}
+        if self.output is not None and len(shape := describe(self.volume, **part).shape) != 3:
             raise ValueError(f"expected one volume (D, H, W) to write a scene of; {self.volume} has {tuple(shape)}")
-        volume = load_volume(self.volume)
-        file, voxel = str(self.volume.resolve()), min(volume.spacing)
+        volume = load_volume(self.volume, frame=self.frame, channel=self.channel)
+        file: str | dict[str, Any] = str(self.volume.resolve())
+        if chosen := {name: index for name, index in part.items() if index is not None}:
+            file = {"file": file, **chosen}
+        voxel = min(volume.spacing)
         if self.output is not None:  # what would not render is refused before the work
             samples, unknown = resolved(volume.samples, self.nan)
             if unknown is not None:
@@ -542,7 +581,7 @@ def _check_scene(path: Path, content: dict[str, Any]) -> str:
     from filterlab.scenes.model import Scene
 
     try:
-        content["volume"].encode()
+        str(content["volume"]).encode()
     except UnicodeEncodeError:
         raise ValueError(f"expected a name in UTF-8 to write into a scene; got {content['volume']!r}") from None
     text = dump_data(content)
@@ -586,7 +625,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if arguments and arguments[0] in SHOWING:
             arguments, overrides = split_overrides(arguments)
-        return _parse(arguments or ["--help"]).run(overrides) or OK
+        with _warnings_told():
+            return _parse(arguments or ["--help"]).run(overrides) or OK
     except SystemExit as exit:  # tyro: --help, or usage
         return exit.code if isinstance(exit.code, int) else USAGE
     except UsageError as error:
@@ -609,6 +649,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("filterlab: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+@contextmanager
+def _warnings_told() -> Iterator[None]:
+    """Tells what is odd about volume files in one line each on stderr."""
+
+    def tell(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if issubclass(category, VolumeFileWarning):
+            print(f"filterlab: {message}", file=sys.stderr)
+        else:
+            usual(message, category, *where, **more)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", VolumeFileWarning)
+        usual, warnings.showwarning = warnings.showwarning, tell
+        yield
 
 
 def _parse(arguments: list[str]) -> Any:
@@ -705,12 +761,38 @@ def _check_device(name: str) -> None:
         ) from None
 
 
-def _result_type(name: str, source: VolumeHeader) -> torch.dtype:
+INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
+
+
+def _result_type(name: str | None, source: VolumeHeader) -> str | None:
+    """The type in the file, by NumPy's name; None: what the values need."""
+    if name is None:
+        return None
+    _check_name("dtype", name, ["float32", "float64", *INTEGERS, "input"])
+    if name != "input":
+        return name
+    if source.dtype.is_floating_point:
+        return str(source.dtype).removeprefix("torch.")
+    return source.stored if source.stored in INTEGERS else "uint8"  # bool
+
+
+def _working_type(stored: str | None, source: VolumeHeader) -> torch.dtype:
+    """What is computed in: float64 where that comes in or goes out, or wide integers do."""
     import torch
 
-    types = {n: getattr(torch, n) for n in ("float32", "float64", "uint8", "int8", "int16", "int32", "int64")}
-    _check_name("dtype", name, [*types, "input"])
-    return source.dtype if name == "input" else types[name]
+    wide = ("float64", "int32", "uint32", "int64", "uint64")
+    if source.dtype == torch.float64 or stored == "float64":
+        return torch.float64
+    return torch.float64 if source.stored in wide and stored != "float32" else torch.float32
+
+
+def _tell_labels(volume: Volume, source: VolumeHeader, path: Path) -> None:
+    """Warns of a volume whose values are likely to be names, between which nothing lies."""
+    from filterlab.labels import look_like_labels
+
+    if source.fields.get("intent") == "labels" or look_like_labels(volume.samples):
+        what = "its values look like labels, and are mixed like amounts; --labels or --method nearest keeps them"
+        print(f"filterlab: {path}: {what}", file=sys.stderr)
 
 
 def _limit(gigabytes: float) -> int:
@@ -725,7 +807,7 @@ def _tell_rounding(volume: Volume, output: Path, nifti2: bool) -> None:
     from filterlab.io import nifti
     from filterlab.io.volumes import format_of
 
-    if format_of(output).name == "NIfTI" and not nifti2 and nifti.fits_nifti1(volume):
+    if format_of(output).name == "NIfTI" and nifti.version_for(volume, nifti2) == 1:
         lost = nifti.rounding(volume.affine)
         if lost > 0:
             what = f"{output}: the affine is rounded to float32, by {lost:.0e} of itself; --nifti2 keeps it"
@@ -758,16 +840,22 @@ def _installed_memory() -> float:
         return math.inf
 
 
-def _converted(volume: Volume, dtype: torch.dtype) -> Volume:
-    """The volume in that type; integers are rounded, and clipped to what the type holds."""
+def _converted(volume: Volume, stored: str | None) -> Volume:
+    """The volume in a type that holds what is stored; integers are rounded, and clipped to what that holds."""
+    import numpy as np
     import torch
 
+    from filterlab.io.bounded import SAMPLE_TYPES
+
+    if stored is None or not volume.dtype.is_floating_point:  # integers are written as they are, or refused
+        return volume
+    dtype = getattr(torch, SAMPLE_TYPES[stored])
     if dtype.is_floating_point:
         return volume.to(dtype)
-    info = torch.iinfo(dtype)
-    samples = volume.samples.round().clamp(info.min, info.max)
-    top = samples >= float(info.max)  # the largest int64 is no float: converting it would wrap round
-    return type(volume).with_geometry(samples.to(dtype).masked_fill(top, info.max), volume.geometry)
+    least, most = int(np.iinfo(stored).min), min(int(np.iinfo(stored).max), torch.iinfo(dtype).max)
+    samples = volume.samples.round().clamp(least, most)
+    top = samples >= float(most)  # the largest int64 is no float: converting it would wrap round
+    return type(volume).with_geometry(samples.to(dtype).masked_fill(top, most), volume.geometry)
 
 
 def _yes(value: bool) -> str:
@@ -805,13 +893,53 @@ def _described(header: VolumeHeader) -> list[tuple[str, str]]:
         ("spacing", numbers(header.spacing)),
         ("origin", numbers(header.origin)),
         ("extent", numbers(extent)),
-        ("world axes", header.world or "not declared"),
+        ("world axes", _axes(header.world)),
+        *([("unit", header.world.unit)] if header.world.unit else []),
+        *_forms(header.world),
     ]
-    if len(header.shape) == 5:
-        lines.insert(2, ("batch, channels", f"{header.shape[0]}, {header.shape[1]}"))
+    lines[2:2] = _choice(header)
     if np.count_nonzero(header.affine[:3, :3] - np.diag(header.spacing)):
         lines += [("affine" if i == 0 else "", numbers(row)) for i, row in enumerate(header.affine)]
     return lines + list(header.fields.items())
+
+
+def _axes(world: World) -> str:
+    """What the axes of a world are, and what they are called in the file where that is something else."""
+    if world.axes is None:
+        return "not declared"
+    return world.axes if world.space in (world.axes, RAS) else f"{world.axes} (declared {world.space})"
+
+
+def _forms(world: World) -> list[tuple[str, str]]:
+    """What a NIfTI file says of its place."""
+    forms = world.nifti
+    if forms is None:
+        return []
+    elsewhere = "; they tell different places" if forms.to_qform else ""
+    time = "" if forms.time == "unknown" else f", time in {forms.time}"
+    return [("codes", f"NIfTI-{forms.version}, sform {forms.sform}, qform {forms.qform}{elsewhere}{time}")]
+
+
+def _choice(header: VolumeHeader) -> list[tuple[str, str]]:
+    """How many frames and channels there are, where there are several, and which one this is."""
+    choice, lines = header.choice, []
+    for name, count, index in (
+        ("frames", choice.frames, choice.frame),
+        ("channels", choice.channels, choice.channel),
+    ):
+        if count > 1:
+            lines.append((name, f"{count}" if index is None else f"{count}; this is {index}"))
+    return lines
+
+
+def _tell_open_choice(header: VolumeHeader) -> bool:
+    """Whether the voxels are those of one volume; if not, says on stderr what to choose."""
+    try:
+        header.check_choice()
+    except ValueError as error:
+        print(f"filterlab: no voxels are read: {error}", file=sys.stderr)
+        return False
+    return True
 
 
 def _distribution(samples: torch.Tensor) -> list[tuple[str, str]]:

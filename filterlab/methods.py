@@ -36,7 +36,7 @@ from filterlab.fields.type6 import CUBIC_C1, QSS
 from filterlab.kernels import Kernel, PiecewisePolynomial, TensorKernel
 from filterlab.ops.differentiable import gather
 from filterlab.prefilters import Prefilter
-from filterlab.volume import Boundary, Volume, as_volume
+from filterlab.volume import Boundary, Volume, as_volume, exact_float
 
 SampledScheme = Callable[[Sampler], Scheme]
 
@@ -319,6 +319,7 @@ def _interpolates(kernel: Kernel, prefilter: Prefilter) -> bool:
 METHODS: dict[str, Method] = {
     m.name: m
     for m in (
+        TensorProduct("nearest", "the nearest sample: for labels, and to see the voxels", kernels.bspline(0)),
         TensorProduct(
             "trilinear",
             "linear interpolation along each axis: the de facto standard",
@@ -431,7 +432,8 @@ def reconstruct(
         sampler: for `sampled`: `exact`, `texture_unit` (8-bit fractions) or a callable.
         storage: how coefficients are stored: float64, float32, float16, bfloat16, int16, int8 or uint8 (a torch.dtype
             or its name; integers with a scale and an offset, see `filterlab.fields.storage`). Default: prefiltered
-            ones as promote(samples, float32), others as the samples are. Arithmetic does not depend on it.
+            ones as promote(samples, float32), others as the samples are; float64 for integers that float32 does not
+            hold. Arithmetic does not depend on it.
         nan: what becomes of voxels that are NaN or infinite: `refuse`, `propagate` (the field is NaN exactly where its
             kernel reaches one) or `fill` (values from the voxels around); see `filterlab.missing_values`.
 
@@ -441,8 +443,8 @@ def reconstruct(
 
     Raises:
         ValueError: unknown name, a combination that the method does not offer, voxels that are not finite (with their
-            number), a storage that can't hold the coefficients, or a fused scheme that cannot run here (the message
-            says what is missing).
+            number), integers beyond 2⁵³, a storage that can't hold the coefficients, or a fused scheme that cannot run
+            here (the message says what is missing).
     """
     if prefilter and isinstance(method, TensorKernel):
         raise ValueError(f"the kernel {method.name} is a TensorKernel and has no prefilter; pass prefilter=False")
@@ -452,6 +454,8 @@ def reconstruct(
     scheme = scheme_named(scheme)
     method.scheme(scheme, gradient, sampler)  # refused before the samples are read
     samples, unknown = missing_values.resolved(volume.samples, nan)
+    if exact_float(samples) != torch.promote_types(samples.dtype, torch.float32):
+        samples = samples.double()
     return method.build(volume, Asked(samples, unknown, boundary, prefilter, scheme, gradient, sampler, storage))
 
 

@@ -1,8 +1,11 @@
-"""A volume on another grid, by any method: separable where the grids are aligned and the method is, else pointwise."""
+"""A volume on another grid, by any method: separable where the grids are aligned and the method is, else pointwise.
+
+The nearest sample is taken as it stands, in its own type.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -11,9 +14,11 @@ from torch import Tensor
 from filterlab.fields.base import Field
 from filterlab.fields.grid import GridField, Term
 from filterlab.kernels import PiecewisePolynomial
-from filterlab.methods import Method, reconstruct
+from filterlab.labels import strongest
+from filterlab.methods import METHODS, Method, as_method, reconstruct
+from filterlab.missing_values import resolved
 from filterlab.ops.reference.gather import locate, tap_weights
-from filterlab.volume import Boundary, Geometry, Volume, as_volume
+from filterlab.volume import Boundary, Geometry, Volume, as_volume, exact_float
 
 POINTS_AT_ONCE = 1 << 20
 
@@ -29,6 +34,7 @@ def resample(
     prefilter: bool = True,
     dtype: torch.dtype | None = None,
     nan: str = "refuse",
+    labels: bool = False,
 ) -> Volume:
     """The volume reconstructed by a method and sampled on another grid.
 
@@ -39,7 +45,11 @@ def resample(
             the old box of voxels; along an axis of length n·s it has max(1, round(n·s/spacing)) voxels.
         shape: new (D, H, W). The box of voxels is kept exactly, the spacing follows.
         like: a volume whose grid is taken over, wherever it lies (rotated too); outside the old box the boundary rules.
-        dtype: floating type of the computation and the result; default promote(volume.dtype, float32).
+        dtype: floating type of the computation and the result; default promote(volume.dtype, float32), and float64 for
+            integers that float32 does not hold. With `nearest` and with `labels`: the volume's.
+        labels: every value is a name. Of each the indicator is resampled, and the one that is greatest wins, of equal
+            ones the least: no value arises that the volume has not. Takes as long as resampling once for every label,
+            in the memory of one. Not differentiable.
 
     Exactly one of spacing, shape and like must be given. This reconstructs, it does not anti-alias: when the new grid
     is coarser than the old one, blur first. Cost: one pass of S taps per axis; memory: about two volumes of the larger
@@ -47,12 +57,25 @@ def resample(
 
     Returns:
         a Volume, differentiable in the samples.
+
+    Raises:
+        ValueError: also for integers that the type of the computation does not hold.
     """
-    volume = as_volume(volume)
+    volume, boundary = as_volume(volume), Boundary.named(boundary)
     target_shape, geometry = _target(volume, spacing, shape, None if like is None else as_volume(like))
-    dtype = dtype or torch.promote_types(volume.dtype, torch.float32)
+    if labels or as_method(method) is METHODS["nearest"]:
+        if dtype not in (None, volume.dtype):
+            raise ValueError(f"nearest samples and labels keep their type, {volume.dtype}; got dtype={dtype}")
+        take = _labelled(method, prefilter) if labels else _nearest
+        complete = Volume.with_geometry(_complete(volume.samples, nan), volume.geometry)
+        samples = take(complete, target_shape, geometry, boundary)
+        return Volume.with_geometry(samples, geometry)
+    needed = exact_float(volume.samples)
+    dtype = dtype or needed
     if not dtype.is_floating_point:
         raise ValueError(f"dtype must be a floating type (round and clip the result for {dtype}); got {dtype}")
+    if needed == torch.float64 and dtype != needed and not volume.dtype.is_floating_point:
+        raise ValueError(f"{dtype} does not hold the integers of this volume exactly; float64 does")
     working = torch.promote_types(dtype, torch.float32)
     field = reconstruct(
         volume if volume.dtype == working else volume.to(working),
@@ -61,13 +84,27 @@ def resample(
         prefilter=prefilter,
         nan=nan,
     )
-    steps = np.linalg.solve(volume.affine, geometry.affine)  # new voxel -> old voxel
-    off_axis = np.abs(steps[:3, :3] - np.diag(np.diag(steps[:3, :3]))).max()
-    if isinstance(field, GridField) and field.scheme.terms and off_axis <= 1e-12 * np.abs(steps[:3, :3]).max():
-        samples = _separable(field, target_shape, np.diag(steps)[:3], steps[:3, 3], working)
-    else:
-        samples = _pointwise(field, volume.samples.device, target_shape, geometry, working)
+    samples = _sampled(field, volume, target_shape, geometry, working)
     return Volume.with_geometry(samples.to(dtype), geometry)
+
+
+def _sampled(
+    field: Field, volume: Volume, shape: tuple[int, int, int], geometry: Geometry, dtype: torch.dtype
+) -> Tensor:
+    """The field of a volume at the voxel centres of another grid."""
+    steps = _aligned(volume.geometry, geometry)
+    if isinstance(field, GridField) and field.scheme.terms and steps is not None:
+        return _separable(field, shape, *steps, dtype)
+    return _pointwise(field, volume.samples.device, shape, geometry, dtype)
+
+
+def _aligned(old: Geometry, new: Geometry) -> tuple[np.ndarray, np.ndarray] | None:
+    """(scale, start) with old voxel = scale · new voxel + start, along each axis; None: axes are mixed."""
+    steps = np.linalg.solve(old.affine, new.affine)
+    off_axis = np.abs(steps[:3, :3] - np.diag(np.diag(steps[:3, :3]))).max()
+    if off_axis > 1e-12 * np.abs(steps[:3, :3]).max():
+        return None
+    return np.diag(steps)[:3], steps[:3, 3]
 
 
 def _target(
@@ -94,7 +131,7 @@ def _target(
     affine[:3, :3] = direction * new
     affine[:3, 3] = center - affine[:3, :3] @ ((size - 1) / 2)
     w, h, d = (int(n) for n in size)
-    return (d, h, w), Geometry.of(affine=affine)
+    return (d, h, w), Geometry.of(affine=affine, world=volume.world)
 
 
 def _separable(
@@ -149,3 +186,68 @@ def _pointwise(
         parts.append(field(points if field.channels is None else points[None]))
     samples = torch.cat(parts, -1)
     return samples.reshape(*samples.shape[:-1], *shape)
+
+
+# --- samples as they stand --------------------------------------------------------------------------------------------
+
+NEARER = 1e-9  # voxels: so much nearer may the earlier of two samples be, and still the later one is taken
+
+
+def _complete(samples: Tensor, nan: str) -> Tensor:
+    """The samples with those that are missing filled in, or as they are where they may stay. Raises ValueError."""
+    return samples if nan == "propagate" else resolved(samples, nan)[0]
+
+
+def _nearest(volume: Volume, shape: tuple[int, int, int], geometry: Geometry, boundary: Boundary) -> Tensor:
+    """The sample nearest to every voxel centre of another grid; halfway between two of them, the later."""
+    steps = _aligned(volume.geometry, geometry)
+    if steps is not None:
+        return _nearest_along_axes(volume, shape, steps, boundary)
+    d, h, w = shape
+    device, to_old = volume.samples.device, np.linalg.solve(volume.affine, geometry.affine)
+    matrix = torch.from_numpy(to_old).to(device)
+    parts = []
+    for begin in range(0, d * h * w, POINTS_AT_ONCE):
+        i = torch.arange(begin, min(begin + POINTS_AT_ONCE, d * h * w), device=device)
+        voxels = torch.stack((i % w, i // w % h, i // (w * h)), -1).to(torch.float64)
+        x, y, z = (voxels @ matrix[:3, :3].T + matrix[:3, 3]).unbind(-1)
+        found = [_chosen(p, n, boundary) for p, n in zip((x, y, z), volume.size, strict=True)]
+        part = volume.samples[..., found[2][0], found[1][0], found[0][0]]
+        parts.append(part * (found[0][1] & found[1][1] & found[2][1]))
+    samples = torch.cat(parts, -1)
+    return samples.reshape(*samples.shape[:-1], *shape)
+
+
+def _nearest_along_axes(
+    volume: Volume, shape: tuple[int, int, int], steps: tuple[np.ndarray, np.ndarray], boundary: Boundary
+) -> Tensor:
+    samples = volume.samples
+    for axis, n in enumerate(shape[::-1]):
+        x = float(steps[0][axis]) * torch.arange(n, dtype=torch.float64, device=samples.device) + float(steps[1][axis])
+        index, inside = _chosen(x, volume.size[axis], boundary)
+        samples = samples.index_select(-1 - axis, index) * inside.reshape(-1, *(1 for _ in range(axis)))
+    return samples
+
+
+def _chosen(x: Tensor, n: int, boundary: Boundary) -> tuple[Tensor, Tensor]:
+    """The sample of an axis of n that is nearest to each coordinate, and whether it is one: zeros has others beyond."""
+    index = (x + (0.5 + NEARER)).floor().long()
+    inside = (index >= 0) & (index < n) if boundary is Boundary.ZEROS else torch.ones_like(index, dtype=torch.bool)
+    return boundary.source(index, n), inside
+
+
+def _labelled(
+    method: str | Method | PiecewisePolynomial, prefilter: bool
+) -> Callable[[Volume, tuple[int, int, int], Geometry, Boundary], Tensor]:
+    """What takes, at every voxel of another grid, the label that a method finds strongest."""
+
+    def labelled(volume: Volume, shape: tuple[int, int, int], geometry: Geometry, boundary: Boundary) -> Tensor:
+        def resampled(indicator: Tensor) -> Tensor:
+            field = reconstruct(
+                Volume.with_geometry(indicator, volume.geometry), method, boundary=boundary, prefilter=prefilter
+            )
+            return _sampled(field, volume, shape, geometry, torch.float32)
+
+        return strongest(volume.samples, resampled, boundary)
+
+    return labelled

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor
+
+from filterlab.world import UNDECLARED, World
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -184,10 +186,12 @@ class Geometry:
     Attributes:
         matrix: 3 rows of the map from voxel steps to world steps; column d is the world step of one voxel along axis d.
         origin: world position of the centre of voxel (0, 0, 0).
+        world: what is declared of the world; it takes part in nothing but files, and in no comparison.
     """
 
     matrix: Matrix = IDENTITY
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    world: World = field(default=UNDECLARED, compare=False)
 
     def __post_init__(self) -> None:
         m = np.asarray(self.matrix, dtype=np.float64)
@@ -203,6 +207,7 @@ class Geometry:
         spacing: Sequence[float] | float | None = None,
         origin: Sequence[float] | None = None,
         affine: ArrayLike | Tensor | None = None,
+        world: World = UNDECLARED,
     ) -> Geometry:
         """From spacing and origin (x, y, z), or from a 4×4 affine voxel → world (not both)."""
         if affine is not None:
@@ -211,13 +216,14 @@ class Geometry:
             a = np.asarray(affine, dtype=np.float64)
             if a.shape != (4, 4) or not np.isfinite(a).all() or not np.allclose(a[3], (0, 0, 0, 1)):
                 raise ValueError(f"affine must be a finite 4×4 matrix with last row 0 0 0 1; got {a.tolist()}")
-            return cls(tuple(map(tuple, a[:3, :3].tolist())), tuple(a[:3, 3].tolist()))  # type: ignore[arg-type]
+            return cls(tuple(map(tuple, a[:3, :3].tolist())), tuple(a[:3, 3].tolist()), world)  # type: ignore[arg-type]
         s = _triple("spacing", 1.0 if spacing is None else spacing)
         if min(s) <= 0:
             raise ValueError(f"spacing must be positive; got {s} (use an affine for flipped axes)")
         return cls(
             ((s[0], 0.0, 0.0), (0.0, s[1], 0.0), (0.0, 0.0, s[2])),
             _triple("origin", (0.0, 0.0, 0.0) if origin is None else origin),
+            world,
         )
 
     @property
@@ -287,6 +293,7 @@ class Volume:
         spacing: world length of a voxel along x, y, z; default 1.
         origin: world position of the centre of voxel (0, 0, 0); default 0.
         affine: instead of both, a 4×4 matrix from voxel (x, y, z, 1) to world.
+        world: what is declared of the world, for the files that the volume is written to.
 
     Raises:
         ValueError: wrong number of axes, an axis without voxels, non-positive spacing, singular affine.
@@ -299,14 +306,15 @@ class Volume:
         spacing: Sequence[float] | float | None = None,
         origin: Sequence[float] | None = None,
         affine: ArrayLike | Tensor | None = None,
+        world: World = UNDECLARED,
     ) -> None:
         self.samples = _checked_samples(samples)
-        self.geometry = Geometry.of(spacing, origin, affine)
+        self.geometry = Geometry.of(spacing, origin, affine, world)
 
     @classmethod
     def with_geometry(cls, samples: Tensor, geometry: Geometry) -> Volume:
         """A volume on a known geometry."""
-        return cls(samples, affine=geometry.affine)
+        return cls(samples, affine=geometry.affine, world=geometry.world)
 
     @property
     def shape(self) -> torch.Size:
@@ -343,6 +351,11 @@ class Volume:
     def affine(self) -> np.ndarray:
         return self.geometry.affine
 
+    @property
+    def world(self) -> World:
+        """What is declared of the world."""
+        return self.geometry.world
+
     def to(self, *args, **kwargs) -> Volume:
         """The same volume with `samples.to(...)`."""
         return Volume.with_geometry(self.samples.to(*args, **kwargs), self.geometry)
@@ -371,6 +384,23 @@ def _checked_samples(samples: Tensor) -> Tensor:
     if samples.dtype in (torch.uint16, torch.uint32, torch.uint64):
         raise TypeError(f"torch cannot index {samples.dtype}; convert: samples.to(torch.int32), int64 or float32")
     return samples
+
+
+def exact_float(samples: Tensor) -> torch.dtype:
+    """The smallest of float32 and float64 that holds every one of the samples: float64 for integers beyond 2²⁴.
+
+    Raises:
+        ValueError: integers beyond 2⁵³, which no floating type holds.
+    """
+    if samples.dtype not in (torch.int32, torch.int64) or samples.numel() == 0:
+        return torch.promote_types(samples.dtype, torch.float32)
+    least, most = (int(v) for v in samples.aminmax())
+    if max(-least, most) > 2**53:
+        raise ValueError(
+            f"expected integers that float64 holds, up to 2⁵³, to compute with; got {most if most > 2**53 else least} "
+            "(method 'nearest' and labels=True keep any)"
+        )
+    return torch.float64 if max(-least, most) > 2**24 else torch.float32
 
 
 def as_volume(volume: Volume | Tensor) -> Volume:

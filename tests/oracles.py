@@ -149,6 +149,7 @@ class Recipe:
 
 
 RECIPES: dict[str, Recipe] = {
+    "nearest": Recipe("bspline0"),
     "trilinear": Recipe("linear"),
     "catmull-rom": Recipe("catmull-rom"),
     "triquadratic": Recipe("bspline2", ("bspline2",)),

@@ -19,6 +19,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 # each room may import the rooms before it (and itself); the same number: neither imports the other
 FLOORS = {
+    "world": -1,
     "forking": 0,
     "volume": 0,
     "kernels": 0,
@@ -32,6 +33,7 @@ FLOORS = {
     "signals": 4,
     "methods": 4,
     "surfaces": 4,
+    "labels": 4,
     "resampling": 5,
     "spectrum": 5,
     "costs": 5,

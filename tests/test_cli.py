@@ -9,13 +9,15 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import nibabel
+import nrrd
 import numpy as np
 import pytest
 import torch
 
 from filterlab import METHODS, Volume, load_volume, resample, save_volume, signals
 from filterlab.cli import UsageError, main, split_overrides
-from filterlab.io import load_image
+from filterlab.io import describe, load_image
 
 SCENE = """
 signal: {name: marschner-lobb, samples: 12}
@@ -185,7 +187,7 @@ def test_info(capsys: pytest.CaptureFixture[str], volume_file: Path) -> None:
     assert (found["spacing"], found["origin"], found["extent"]) == ("1 2 3", "10 20 30", "6 10 12")
     assert found["range"] == f"{samples.min()} … {samples.max()}"
     assert found["mean"] == f"{samples.double().mean():.6g}"
-    assert found["world axes"] == "RAS"
+    assert found["world axes"] == "not declared"
     assert main(["info", str(volume_file), "--header-only"]) == 0
     assert "range" not in facts(capsys.readouterr().out)
 
@@ -219,6 +221,78 @@ def test_info_shows_a_rotated_affine_and_odd_names(capsys: pytest.CaptureFixture
     printed = capsys.readouterr().out
     assert facts(printed)["affine"] == "0 -1 0 5"
     assert "[red]a.npz" in printed
+
+
+@pytest.fixture
+def series_file(tmp_path: Path) -> Path:
+    """Two frames of three channels each, in a NIfTI file."""
+    path = tmp_path / "series.nii"
+    samples = np.random.default_rng(0).integers(0, 100, (6, 5, 4, 2, 3)).astype(np.int16)
+    image = nibabel.Nifti1Image(samples, np.diag([1.0, 2, 3, 1]))
+    image.header.set_xyzt_units("mm", "sec")
+    nibabel.save(image, path)
+    return path
+
+
+def test_info_shows_every_header(capsys: pytest.CaptureFixture[str], series_file: Path) -> None:
+    assert main(["info", str(series_file)]) == 0
+    printed = capsys.readouterr()
+    found = facts(printed.out)
+    assert (found["frames"], found["channels"], found["size (x, y, z)"]) == ("2", "3", "6 × 5 × 4")
+    assert found["codes"] == "NIfTI-1, sform 2, qform 0, time in sec"
+    assert (found["world axes"], found["unit"]) == ("RAS", "mm")
+    assert "range" not in found
+    assert "no voxels are read" in printed.err
+    assert "a choice among its 2 frames, frame=0 to frame=1" in printed.err
+    assert main(["info", str(series_file), "--frame", "1", "--channel", "2"]) == 0
+    printed = capsys.readouterr()
+    found, samples = facts(printed.out), load_volume(series_file, frame=1, channel=2).samples
+    assert (found["frames"], found["channels"]) == ("2; this is 1", "3; this is 2")
+    assert found["range"] == f"{samples.min()} … {samples.max()}"
+    assert printed.err == ""
+    fails(capsys, ["info", series_file, "--frame", "2"], 1, "a frame from 0 to 1; got frame 2")
+
+
+def test_frames_and_channels_are_chosen_everywhere(
+    capsys: pytest.CaptureFixture[str], series_file: Path, tmp_path: Path
+) -> None:
+    part, out = ["--frame", "1", "--channel", "2"], tmp_path / "out.nrrd"
+    expected = load_volume(series_file, frame=1, channel=2)
+    line = ["resample", str(series_file), "-o", str(out), "--shape", "6", "5", "4"]
+    assert main([*line, *part]) == 0
+    assert torch.equal(load_volume(out).samples, resample(expected, shape=(4, 5, 6)).samples)
+    fails(capsys, line, 1, "a choice among its 2 frames")
+    surface = [str(series_file), "--level", "50", "-o", str(tmp_path / "a.png"), "--size", "12", "8"]
+    save_volume(expected, tmp_path / "one.nii")
+    assert main(["render", *surface, *part]) == 0
+    assert main(["render", str(tmp_path / "one.nii"), *surface[1:3], "-o", str(tmp_path / "b.png"), *surface[5:]]) == 0
+    assert torch.equal(load_image(tmp_path / "a.png"), load_image(tmp_path / "b.png"))
+    fails(capsys, ["render", *surface], 1, "a choice among its 2 frames")
+    scene = tmp_path / "scene.yaml"
+    for volume in (series_file.name, f"{{file: {series_file.name}, channel: 0}}"):
+        scene.write_text(f"volume: {volume}\nsurface: {{level: 50}}\n")
+        assert main(["mesh", str(scene), "-o", str(tmp_path / "a.ply"), *part]) == 0
+    assert main(["mesh", str(tmp_path / "one.nii"), "--level", "50", "-o", str(tmp_path / "b.ply")]) == 0
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    capsys.readouterr()
+    recommended = ["recommend", str(series_file), "--max-error", "50%", "-o", str(tmp_path / "found.yaml")]
+    assert main([*recommended, *part]) == 0
+    text = (tmp_path / "found.yaml").read_text()
+    assert "frame: 1" in text
+    assert "channel: 2" in text
+    capsys.readouterr()
+    fails(capsys, recommended, 1, "a choice among its 2 frames")
+
+
+def test_what_is_odd_about_a_file_is_told_in_a_line(
+    capsys: pytest.CaptureFixture[str], series_file: Path, tmp_path: Path
+) -> None:
+    series_file.write_bytes(series_file.read_bytes() + b"more")
+    for command in (["info", str(series_file)], ["resample", str(series_file), "-o", "out.npy", "--shape", *"222"]):
+        command = [str(tmp_path / a) if a == "out.npy" else a for a in command]
+        assert main([*command, "--frame", "0", "--channel", "0"]) == 0
+        told = f"filterlab: {series_file}: passed over what comes behind its 1440 bytes of samples\n"
+        assert capsys.readouterr().err == told
 
 
 def test_info_of_a_damaged_file(capsys: pytest.CaptureFixture[str], volume_file: Path) -> None:
@@ -304,6 +378,64 @@ def test_resample_to_integers_rounds_and_clips(tmp_path: Path) -> None:
         line = ["resample", str(tmp_path / "big.nrrd"), "-o", str(tmp_path / "out.nrrd"), "--shape", *"211"]
         assert main([*line, "--dtype", dtype]) == 0
         assert (load_volume(tmp_path / "out.nrrd").samples == torch.iinfo(getattr(torch, dtype)).max).all()
+
+
+@pytest.fixture
+def label_file(tmp_path: Path) -> Path:
+    """Balls of the labels 0, 2, 4 in uint16."""
+    z, y, x = np.indices((12, 12, 12)) - 5.5
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    samples = np.select([radius < 2.5, radius < 4.5], [4, 2], 0).astype(np.uint16)
+    nrrd.write(str(tmp_path / "labels.nrrd"), samples, index_order="C")
+    return tmp_path / "labels.nrrd"
+
+
+@pytest.mark.parametrize("how", [["--labels"], ["--labels", "--method", "notch"], ["--method", "nearest"]])
+def test_labels_stay_labels(capsys: pytest.CaptureFixture[str], label_file: Path, tmp_path: Path, how: list) -> None:
+    out = tmp_path / "out.nrrd"
+    line = ["resample", str(label_file), "-o", str(out), "--shape", "19", "18", "17"]
+    assert main(line) == 0
+    assert "labels.nrrd: its values look like labels" in capsys.readouterr().err
+    assert len(load_volume(out).samples.unique()) > 100
+    assert main([*line, *how]) == 0
+    assert capsys.readouterr().err == ""
+    assert load_volume(out).samples.unique().tolist() == [0, 2, 4]
+    assert describe(out).stored == "uint16"
+    method = how[-1] if "--method" in how else "triquadratic"
+    expected = resample(load_volume(label_file), method, shape=(17, 18, 19), labels="--labels" in how)
+    assert torch.equal(load_volume(out).samples, expected.samples)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int8, np.uint16, np.int16, np.uint32, np.int32, np.uint64, np.int64])
+@pytest.mark.parametrize("method", ["nearest", "trilinear"])
+def test_integers_come_out_as_they_went_in(tmp_path: Path, dtype: type, method: str) -> None:
+    """To the last digit, in their own type; what float64 cannot hold, and is computed with, is refused."""
+    info, out = np.iinfo(dtype), tmp_path / "out.nrrd"
+    largest = min(info.max, 2**63 - 1)
+    for top in {largest, min(largest, 2**53), min(largest, 16_777_217)}:
+        samples = np.array([[[info.min, 0, 1, top]]]) if info.min > -(2**53) else np.array([[[-5, 0, 1, top]]])
+        nrrd.write(str(tmp_path / "in.nrrd"), samples.astype(dtype), index_order="C")
+        line = ["resample", str(tmp_path / "in.nrrd"), "-o", str(out), "--shape", "4", "1", "1", "--method", method]
+        code = main([*line, "--dtype", "input"])
+        assert code == (1 if method == "trilinear" and top > 2**53 else 0)
+        if code == 0:
+            assert describe(out).stored == np.dtype(dtype).name
+            assert load_volume(out).samples.tolist() == samples.tolist()
+        if code == 0 and method == "trilinear" and top > 2**24:
+            assert main(line) == 0
+            assert describe(out).stored == "float64"
+            assert load_volume(out).samples.tolist() == samples.tolist()
+            assert main([*line, "--dtype", "float32"]) == 1
+
+
+def test_results_are_rounded_and_clipped_to_every_integer_type(tmp_path: Path) -> None:
+    save_volume(Volume(torch.tensor([[[-1e30, -1.4, 0.6, 1e30]]])), tmp_path / "in.nrrd")
+    line = ["resample", str(tmp_path / "in.nrrd"), "-o", str(tmp_path / "out.nrrd"), "--shape", "4", "1", "1"]
+    for name in ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64"):
+        assert main([*line, "--method", "nearest", "--dtype", name]) == 0
+        least, most = np.iinfo(name).min, min(np.iinfo(name).max, 2**63 - 1)
+        assert load_volume(tmp_path / "out.nrrd").samples.tolist() == [[[least, max(least, -1), 1, most]]]
+        assert describe(tmp_path / "out.nrrd").stored == name
 
 
 def test_resample_refuses_before_it_works(

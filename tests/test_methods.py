@@ -17,6 +17,7 @@ from tests import laws, oracles
 
 SHAPES = ((5, 7, 6), (1, 2, 3), (4, 3, 1), (2, 1, 9))
 TENSOR_PRODUCTS = tuple(name for name in METHODS if tensor_product(name))
+CONTINUOUS = tuple(name for name in TENSOR_PRODUCTS if METHODS[name].facts.continuity >= 0)
 every_method = pytest.mark.parametrize("method", METHODS)
 every_boundary = pytest.mark.parametrize("boundary", Boundary)
 
@@ -91,6 +92,8 @@ def test_the_ends_of_the_box_and_of_a_period_are_right(method, scheme, gradient,
         f = samples_of(shape)
         axes = [np.array([-n, -1, -0.5, 0, n - 1, n - 0.5, n, 2 * n - 2]) for n in shape[::-1]]
         points = np.stack(np.meshgrid(*axes), -1).reshape(-1, 3).astype(float)
+        if METHODS[method].facts.continuity < 0:  # where it jumps, folded points are on either side
+            points += 0.01
         field = reconstruct(
             torch.as_tensor(f), method, boundary=boundary, prefilter=prefilter, scheme=scheme, gradient=gradient
         )
@@ -257,7 +260,7 @@ def test_continuity_is_measured_and_not_exceeded(method):
             jet = [field.jet(torch.as_tensor(p[None]), 2) for p in sides]
             for order in range(3):
                 jumps[order] = max(jumps[order], float((jet[1][order] - jet[0][order]).abs().max()))
-    smooth = [bool(j < 1e-6) for j in jumps]
+    smooth = [bool((jumps[: order + 1] < 1e-6).all()) for order in range(3)]
     assert smooth == [order <= facts.continuity for order in range(3)], jumps
 
 

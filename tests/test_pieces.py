@@ -16,7 +16,7 @@ from filterlab.kernels import KERNELS
 from filterlab.methods import from_kernel
 from filterlab.ops.reference import bounds as hulls
 from tests import oracles
-from tests.test_methods import TENSOR_PRODUCTS
+from tests.test_methods import CONTINUOUS, TENSOR_PRODUCTS
 
 BOUNDARIES = [str(b) for b in fl.Boundary]
 AFFINE = np.array([[1.0, 0.2, 0.0, 3.0], [0.0, 0.5, 0.1, 1.0], [0.1, 0.0, 2.0, -5.0], [0.0, 0.0, 0.0, 1.0]])
@@ -83,7 +83,8 @@ def test_pieces_are_the_field_as_its_definition_gives_it(method, boundary):
     assert np.abs(values_of(pieces, at).numpy().reshape(-1) - expected).max() < 2e-13
 
 
-DEGREES = {"trilinear": 3, "ncrsi": 5, "triquadratic": 6, "notch": 6, "catmull-rom": 9, "mitchell": 9, "tricubic": 9}
+DEGREES = {"nearest": 1, "trilinear": 3, "ncrsi": 5, "triquadratic": 6, "notch": 6}
+DEGREES |= {"catmull-rom": 9, "mitchell": 9, "tricubic": 9}
 
 
 @pytest.mark.parametrize("method", TENSOR_PRODUCTS)
@@ -126,7 +127,7 @@ def test_storage(method, storage):
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_pieces_cover_the_domain_and_share_their_ends(method, boundary):
     """Without gap or overlap from where a ray enters to where it leaves, and equal to the bit where two meet."""
     field = fl.reconstruct(fl.Volume(samples(4, 5, 6), affine=AFFINE), method, boundary=boundary)
@@ -146,7 +147,7 @@ def test_pieces_cover_the_domain_and_share_their_ends(method, boundary):
         assert torch.equal(pieces.coefficients[1:][joined[1:], 0], pieces.coefficients[:-1][joined[1:], -1])
 
 
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_pieces_of_awkward_rays(method):
     field = fl.reconstruct(fl.Volume(samples(4, 5, 6), affine=AFFINE), method)
     origins, directions = awkward_rays(field)
@@ -217,7 +218,7 @@ def test_bounds_hold_everywhere_in_a_brick(method, boundary):
     assert bool((found.codes.most(found.high[part]) >= values - 1e-12).all())
 
 
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_no_piece_that_may_hold_the_level_is_left_out(method):
     field = fl.reconstruct(samples(12, 11, 10) ** 6, method)
     origins, directions = rays(field, 60)

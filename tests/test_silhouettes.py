@@ -15,7 +15,7 @@ from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Phong
 from filterlab.render.image import PixelRays, check_background
 from filterlab.render.raycast import Casting
 from filterlab.surfaces import LevelSet
-from tests.test_methods import TENSOR_PRODUCTS
+from tests.test_methods import CONTINUOUS
 
 F64 = torch.float64
 N, RADIUS, SIZE = 16, 3.0, (14, 12)
@@ -64,7 +64,7 @@ def eye(method: str, amount: Tensor, level: Tensor, position: Tensor) -> silhoue
     return casting.eye(seen, ("color",))
 
 
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_edges_move_as_their_derivative_says(method):
     """On folds, smooth and on creases between cells, and on faces: by the places where they are found again."""
     given = [torch.tensor(x, dtype=F64, requires_grad=True) for x in (0.0, -1.0, [4.0, -18.0, 6.0])]

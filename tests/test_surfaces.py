@@ -17,7 +17,7 @@ from filterlab.methods import METHODS, from_kernel
 from filterlab.render import PerspectiveCamera
 from filterlab.surfaces import LevelSet
 from tests import laws, ray_oracle
-from tests.test_methods import TENSOR_PRODUCTS
+from tests.test_methods import CONTINUOUS
 
 BOUNDARIES = [str(b) for b in fl.Boundary]
 SIZE = np.array([7, 6, 5])
@@ -103,7 +103,7 @@ def assert_all_found(method: str, boundary: str, classes, count: int, seed: int,
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_every_crossing_is_found_and_no_other(method, boundary):
     counts = [assert_all_found(method, boundary, classes, 6, 0) for classes in (NEAR, (from_far,))]
     assert sum(count["undecided"] for count in counts) <= 3
@@ -115,7 +115,7 @@ def test_nearly_tangent_rays_from_far(method, boundary, seed):
     assert_all_found(method, boundary, (from_far,), 60, seed)
 
 
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_oblique_geometry_moves_nothing(method):
     samples = noise(5, 6, 7)
     affine = np.array([[1.0, 0.2, 0.0, 3.0], [0.0, 0.5, 0.1, 1.0], [0.1, 0.0, 2.0, -5.0], [0.0, 0.0, 0.0, 1.0]])
@@ -129,7 +129,7 @@ def test_oblique_geometry_moves_nothing(method):
     assert float((a - b)[a.isfinite()].abs().max()) < 1e-9 * 100
 
 
-QUADRATIC = [m for m in TENSOR_PRODUCTS if m != "trilinear"]
+QUADRATIC = [m for m in CONTINUOUS if m != "trilinear"]
 """Methods that reproduce quadratics: without prefilter Σ_k k² φ(x − k) = x² + ∫ x² φ."""
 
 
@@ -171,7 +171,7 @@ def test_a_thin_shell(method):
         assert float((surface.hit(origins, directions).t - 20 + 5e-7).abs().max()) < 5e-8
 
 
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_closed_level_sets_are_crossed_an_even_number_of_times(method):
     samples = torch.zeros(14, 14, 14, dtype=torch.float64)
     samples[4:-4, 4:-4, 4:-4] = noise(6, 6, 6)
@@ -184,7 +184,7 @@ def test_closed_level_sets_are_crossed_an_even_number_of_times(method):
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_no_ray_slips_through(method, boundary):
     """A level set that covers the frame: rays between and along all planes of knots."""
     _, _, z = grid(9)
@@ -199,7 +199,7 @@ def test_no_ray_slips_through(method, boundary):
 
 
 def test_float32_differs_by_rounding_only():
-    for method in TENSOR_PRODUCTS:
+    for method in CONTINUOUS:
         surface = LevelSet(fl.reconstruct(noise(5, 6, 7), method, storage="float32"), 0.5)
         origins, directions = (torch.from_numpy(x).float() for x in random(np.random.default_rng(2), 300))
         single, double = surface.hit(origins, directions), surface.hit(origins.double(), directions.double())
@@ -298,7 +298,7 @@ def test_a_level_that_no_value_has_hits_nothing(level):
     assert surface.relevant() == (0, 0)
 
 
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_missing_voxels_are_holes(method):
     """Only where a kernel reaches one; elsewhere every bit stays."""
     samples = ball()
@@ -396,7 +396,7 @@ def camera_rays(shift: Tensor, tilt: Tensor, position: Tensor, target: Tensor, a
     return origins + shift, 1.5 * directions + 0.1 * tilt
 
 
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_gradients_and_second_derivatives(method):
     """t, point and normal in samples, level, rays and the camera that these come from, at the default tolerances."""
     numbers = (-1.1, [[0.1, 0.2, -0.1]], [[0.5, 0.05, -0.05]], *CAMERA)

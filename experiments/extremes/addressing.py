@@ -83,9 +83,11 @@ def many_voxels(subject: Subject, random: np.random.Generator, amount: float) ->
     near = torch.tensor(points, dtype=torch.float32)
     tally = Tally(2e-6)
     own, whole = field_over(subject, corner, 0), field_over(subject, vast, 0)
-    for found, expected in zip(whole.jet(near + (EDGE - CORNER), 1), own.jet(near, 1), strict=True):
+    flat = fl.METHODS[subject.method].facts.continuity < 0  # all derivatives are 0
+    pairs = zip(whole.jet(near + (EDGE - CORNER), 1), own.jet(near, 1), strict=True)
+    for order, (found, expected) in enumerate(pairs):
         tally.error(largest(found - expected) / 255, "another sum than that of the corner alone", count)
-        tally.kept(largest(expected) > 10, "there is nothing in the corner")
+        tally.kept(largest(expected) > 10 or (flat and order > 0), "there is nothing in the corner")
     return tally.finding()
 
 

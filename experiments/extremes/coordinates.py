@@ -202,8 +202,10 @@ def _shifted(x: float, n: int, subject: Subject, spline: Spline) -> tuple[float,
 
 def ends_and_knots(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
     """A step of one unit of rounding across ends, knots and half-knots: value and gradient go on as the class says."""
-    tally, field = Tally(1e-4), field_of(subject)
     facts = fl.METHODS[subject.method].facts
+    if facts.continuity < 0:
+        return Finding(0, 0.0, 0.0, skipped=f"{subject.method} jumps between samples")
+    tally, field = Tally(1e-4), field_of(subject)
     count = max(int(800 * amount), 50)
     size = np.array(SIZE[::-1])
     places = random.integers(-6, 2 * size + 6, (count, 3)) / 2.0  # knots and half-knots, outside too

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import tifffile
@@ -77,7 +78,7 @@ def _inside(outer: Original, name: str, content: bytes, pack: Packer) -> Origina
     return replace(outer, name=name, content=content, pack=pack)
 
 
-def _saved(name: str, **options: bool) -> dict[str, bytes]:
+def _saved(name: str, **options: Any) -> dict[str, bytes]:
     """The files that `save_volume` writes."""
     with TemporaryDirectory() as folder:
         save_volume(Volume(torch.from_numpy(SAMPLES.copy()), affine=AFFINE), Path(folder) / name, **options)

@@ -22,6 +22,7 @@ class Look:
 
 # After Okabe & Ito's palette, which readers with any colour vision can tell apart; markers tell the rest.
 LOOKS: dict[str, Look] = {
+    "nearest": Look("#4d4d4d", "#d0d0d0", "+"),
     "trilinear": Look("#7a7a7a", "#a8a8a8", "o"),
     "catmull-rom": Look("#4aa3d9", "#6bbcec", "s"),
     "ncrsi": Look("#d98c00", "#f0a92c", "^"),

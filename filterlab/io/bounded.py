@@ -23,7 +23,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from filterlab.io.warned import warn
 from filterlab.volume import Geometry, Volume
+from filterlab.world import UNDECLARED, World
 
 BLOCK = 2**20
 MAX_HEADER_BYTES = 2**20
@@ -35,7 +37,8 @@ MAX_SKIP = 2**26  # bytes passed over in bzip2 data, of which a few hold any num
 # zeros are 208 bytes): no ratio tells true claims from false ones.
 EXPANSION = {"raw": 1, "deflate": 1032, "gzip": 1032}
 
-# Stored type -> type of the samples. torch has no arithmetic for uint16 and uint32: they widen to the next signed type.
+# Stored type -> type of the samples. torch has no arithmetic for uint16 to uint64: they widen to the next signed type,
+# and what int64 cannot hold is refused.
 SAMPLE_TYPES = {
     "bool": "uint8",
     "uint8": "uint8",
@@ -45,6 +48,7 @@ SAMPLE_TYPES = {
     "int32": "int32",
     "uint32": "int64",
     "int64": "int64",
+    "uint64": "int64",
     "float16": "float16",
     "float32": "float32",
     "float64": "float64",
@@ -60,19 +64,56 @@ class VolumeFileError(ValueError):
 
 
 @dataclass(frozen=True)
+class Choice:
+    """How many volumes a file holds, and which of them is read.
+
+    Attributes:
+        frames, channels: how many there are, over time and of values per voxel.
+        frame, channel: the chosen ones, from 0; None: none is, which only a file of one frame (channel) answers.
+    """
+
+    frames: int = 1
+    channels: int = 1
+    frame: int | None = None
+    channel: int | None = None
+
+    @classmethod
+    def of(cls, path: Path, frames: int, channels: int, frame: int | None, channel: int | None) -> Choice:
+        """The choice, checked. Raises VolumeFileError for a frame or channel that is not there."""
+        for what, index, count in (("frame", frame, frames), ("channel", channel, channels)):
+            if index is not None and (not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < count):
+                raise VolumeFileError(path, f"a {what} from 0 to {count - 1}", f"{what} {index!r}")
+        return cls(frames, channels, frame, channel)
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """The frame and the channel that are read."""
+        return self.frame or 0, self.channel or 0
+
+    def check(self, path: Path) -> None:
+        """Raises VolumeFileError where one of several volumes has to be chosen."""
+        for what, index, count in (("frame", self.frame, self.frames), ("channel", self.channel, self.channels)):
+            if index is None and count > 1:
+                kind = "time series" if what == "frame" else "file of several values per voxel"
+                choice = f"{what}=0 to {what}={count - 1}"
+                raise VolumeFileError(path, f"a choice among its {count} {what}s, {choice}: this is a {kind}", "none")
+
+
+@dataclass(frozen=True)
 class VolumeHeader:
     """What a volume file says about itself, checked, without its voxels.
 
     Attributes:
         path: the file.
-        format: "NRRD", "NIfTI", "TIFF", "npy", "npz" or "raw".
+        format: "NRRD", "NIfTI", "TIFF", "npy", "npz", "raw" or "ITK".
         shape: of the samples, (D, H, W) or (N, C, D, H, W).
         stored: the type in the file, a NumPy name: "uint16".
-        geometry: voxel -> world.
+        geometry: voxel -> world, and what the file declares of the world.
         encoding: "raw", "gzip", … as the format calls it.
-        world: what the file says its world axes are ("RAS"), or None.
         fields: other lines of the header, for people to read.
         dtype: of the samples; the stored type, or wider where torch lacks that or values are rescaled.
+        choice: which volume of several these samples are.
+        held: values that are read to get at the samples, where they are more.
     """
 
     path: Path
@@ -81,9 +122,10 @@ class VolumeHeader:
     stored: str
     geometry: Geometry
     encoding: str = "raw"
-    world: str | None = None
     fields: dict[str, str] = field(default_factory=dict)
     dtype: torch.dtype = torch.uint8
+    choice: Choice = Choice()
+    held: int = 0
     _read: Callable[[], Tensor] | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -105,12 +147,24 @@ class VolumeHeader:
         return self.geometry.affine
 
     @property
+    def world(self) -> World:
+        """What the file declares of its world."""
+        return self.geometry.world
+
+    @property
     def nbytes(self) -> int:
-        """Bytes of the samples in memory."""
-        return math.prod(self.shape) * max(self.dtype.itemsize, np.dtype(self.stored).itemsize)
+        """Bytes of the samples in memory, or of what is read to get at them."""
+        return max(math.prod(self.shape), self.held) * max(self.dtype.itemsize, np.dtype(self.stored).itemsize)
+
+    def check_choice(self) -> None:
+        """Raises VolumeFileError where the file holds several volumes and none was chosen."""
+        if len(self.shape) == 3:
+            self.choice.check(self.path)
 
     def read(self, max_bytes: int) -> Tensor:
-        """The samples. Raises VolumeFileError if they need more than `max_bytes` or the file is damaged."""
+        """The samples. Raises VolumeFileError if they need more than `max_bytes`, none of several volumes was chosen,
+        or the file is damaged."""
+        self.check_choice()
         if self.nbytes > max_bytes:
             raise VolumeFileError(
                 self.path, f"at most {max_bytes} bytes of samples (max_bytes)", f"{self.nbytes} bytes"
@@ -138,8 +192,8 @@ def check_size(path: Path, size: Sequence[int]) -> tuple[int, ...]:
     return values
 
 
-def check_geometry(path: Path, affine: np.ndarray) -> Geometry:
-    """The geometry of a 4×4 affine. Raises VolumeFileError if it is not finite, absurd in size, or singular."""
+def check_geometry(path: Path, affine: np.ndarray, world: World = UNDECLARED) -> Geometry:
+    """The geometry of a 4×4 affine in a world. Raises VolumeFileError if it is not finite, absurd, or singular."""
     a = np.asarray(affine, dtype=np.float64)
     if a.shape != (4, 4) or not np.isfinite(a).all() or np.abs(a).max() > 1e60:
         raise VolumeFileError(path, "an affine of finite numbers", a.tolist())
@@ -148,7 +202,7 @@ def check_geometry(path: Path, affine: np.ndarray) -> Geometry:
     try:
         if np.abs(a[:3, :3]).max(axis=0).min() < 1e-60:
             raise ValueError
-        return Geometry.of(affine=a + 0.0)  # + 0.0: no negative zeros
+        return Geometry.of(affine=a + 0.0, world=world)  # + 0.0: no negative zeros
     except ValueError:
         what = "voxel steps along x, y, z that span space (an invertible affine)"
         raise VolumeFileError(path, what, a.tolist()) from None
@@ -228,12 +282,15 @@ class Stored:
     def nbytes(self) -> int:
         return math.prod(self.shape) * self.dtype.itemsize
 
-    def check(self) -> None:
-        """Compares the claimed bytes with the length of the file. Raises VolumeFileError."""
+    def check(self, *, exact: bool = False) -> None:
+        """Compares the claimed bytes with the length of the file.
+
+        Raises VolumeFileError; for bytes behind raw samples only if they have to end the file (`exact`).
+        """
         available = max(self.file.stat().st_size - self.offset, 0)
         claimed = self.nbytes + self.skip
         expected = f"{claimed} bytes of samples for {self.shape} {self.dtype.name}"
-        if self.encoding == "raw" and available != claimed:
+        if self.encoding == "raw" and (available < claimed or (exact and available != claimed)):
             raise VolumeFileError(self.header, expected, f"{available} bytes")
         if self.encoding in EXPANSION and claimed > EXPANSION[self.encoding] * available:
             got = f"{available} bytes of {self.encoding} data, which cannot hold that many"
@@ -241,16 +298,59 @@ class Stored:
         if self.encoding not in EXPANSION and self.skip > MAX_SKIP:
             raise VolumeFileError(self.header, f"at most {MAX_SKIP} bytes before the samples", self.skip)
 
-    def read(self) -> np.ndarray:
-        """The samples in native byte order, writable and contiguous."""
+    def read(self, at: Sequence[int | None] = ()) -> np.ndarray:
+        """The samples in native byte order, writable and contiguous.
+
+        Args:
+            at: for each of the first axes, the index that is read of it; None: all of it.
+        """
         self.check()
         with self.file.open("rb") as file:
             file.seek(self.offset)
             with damaged(self.header, f"{self.encoding} data of {self.nbytes} bytes"):
                 stream = decompressed(file, self.encoding)
                 skip_bytes(self.header, stream, self.skip)
-                buffer = read_exactly(self.header, stream, self.nbytes, exact_length=self.encoding == "raw")
-        return native(buffer, self.dtype, self.shape)
+                return read_array(self.header, stream, self.shape, self.dtype, at, raw=self.encoding == "raw")
+
+    def held(self, at: Sequence[int | None]) -> int:
+        """How many values `read(at)` reads at once."""
+        return math.prod(self.shape[_leading(at) :])
+
+
+def _leading(at: Sequence[int | None]) -> int:
+    """How many axes in front are read at an index: what is read of them lies in one piece."""
+    return next((i for i, index in enumerate(at) if index is None), len(at))
+
+
+def read_array(
+    path: Path, stream: BinaryIO, shape: tuple[int, ...], dtype: np.dtype, at: Sequence[int | None], *, raw: bool
+) -> np.ndarray:
+    """The array of that shape in a stream; of axes with an index in `at`, what lies there.
+
+    All of it is passed over, so that damage anywhere is found. What comes behind it is told (of raw data, elsewhere).
+    """
+    leading = _leading(at)
+    first = int(np.ravel_multi_index(at[:leading], shape[:leading])) if leading else 0  # type: ignore[arg-type]
+    parts, count = math.prod(shape[:leading]), math.prod(shape[leading:]) * dtype.itemsize
+    skip_bytes(path, stream, first * count)
+    buffer = read_exactly(path, stream, count, allocate=raw)
+    skip_bytes(path, stream, (parts - 1 - first) * count)
+    _tell_rest(path, stream, parts * count)
+    array = native(buffer, dtype, shape[leading:])
+    rest = tuple(slice(None) if index is None else index for index in at[leading:])
+    return np.ascontiguousarray(array[rest]) if rest else array
+
+
+def _tell_rest(path: Path, stream: BinaryIO, count: int) -> None:
+    """Warns where a stream goes on; it is not read on."""
+    try:
+        more = bool(stream.read(1))
+    except gzip.BadGzipFile as error:
+        if not str(error).startswith("Not a gzipped file"):  # a checksum that does not fit
+            raise
+        more = True
+    if more:
+        warn(path, f"passed over what comes behind its {count} bytes of samples")
 
 
 def decompressed(file: BinaryIO, encoding: str) -> BinaryIO:
@@ -282,13 +382,13 @@ def skip_bytes(path: Path, stream: BinaryIO, count: int) -> None:
         count -= len(block)
 
 
-def read_exactly(path: Path, stream: BinaryIO, count: int, *, exact_length: bool) -> bytearray | np.ndarray:
-    """`count` bytes and then the end of the stream. Raises VolumeFileError if it is shorter or longer.
+def read_exactly(path: Path, stream: BinaryIO, count: int, *, allocate: bool) -> bytearray | np.ndarray:
+    """The next `count` bytes. Raises VolumeFileError if there are fewer.
 
-    A length that was compared with the file's (`exact_length`) is allocated at once; else memory grows with what is
-    really there, so that a header that lies costs no more than the data it has.
+    A length that was compared with the file's is allocated at once (`allocate`); else memory grows with what is really
+    there, so that a header that lies costs no more than the data it has.
     """
-    if exact_length:
+    if allocate:
         whole = np.empty(count, np.uint8)
         done = 0
         while done < count and (n := stream.readinto(memoryview(whole)[done : done + 64 * BLOCK])):  # type: ignore[attr-defined]
@@ -301,8 +401,6 @@ def read_exactly(path: Path, stream: BinaryIO, count: int, *, exact_length: bool
         done = len(buffer)
     if done < count:
         raise VolumeFileError(path, f"{count} bytes of samples", f"the end of the data after {done}")
-    if stream.read(1):
-        raise VolumeFileError(path, f"{count} bytes of samples", "more than that")
     return buffer
 
 
@@ -314,25 +412,52 @@ def native(buffer: bytearray | np.ndarray, dtype: np.dtype, shape: tuple[int, ..
     return array.reshape(shape)
 
 
-def as_tensor(array: np.ndarray, dtype: torch.dtype) -> Tensor:
-    """A contiguous, writable tensor of that type; shares the array's memory where it can."""
+def as_tensor(path: Path, array: np.ndarray, dtype: torch.dtype) -> Tensor:
+    """A contiguous, writable tensor of that type; shares the array's memory where it can.
+
+    Raises VolumeFileError for unsigned integers of 64 bits that int64 cannot hold.
+    """
     wanted = np.dtype(str(dtype).removeprefix("torch."))
+    if array.dtype == np.uint64 and wanted == np.int64 and array.size and (top := int(array.max())) >= 2**63:
+        raise VolumeFileError(path, "uint64 samples below 2⁶³, which int64 holds", top)
     array = np.ascontiguousarray(array if array.dtype == wanted else array.astype(wanted))
     return torch.from_numpy(array if array.flags.writeable else array.copy())
 
 
-def storable(path: Path, volume: Volume, types: Sequence[str]) -> np.ndarray:
+def storable(path: Path, volume: Volume, types: Sequence[str], stored: str | None = None) -> np.ndarray:
     """The (D, H, W) samples of a volume in one of the types; float16 and bfloat16 widen to float32 where they must.
 
-    Raises VolumeFileError for a batch and for any other type.
+    Args:
+        stored: the type that is asked for, by NumPy's name; default the samples' own.
+
+    Raises VolumeFileError for a batch, any other type, or samples that the type that is asked for does not hold.
     """
     samples = volume.samples.detach().cpu()
     if samples.dtype in (torch.float16, torch.bfloat16):
         samples = samples.float()
-    name = str(samples.dtype).removeprefix("torch.")
+    name = stored or str(samples.dtype).removeprefix("torch.")
     if samples.ndim != 3 or name not in types:
-        raise VolumeFileError(path, f"samples (D, H, W) of a type among {', '.join(types)}", f"{volume}")
-    return samples.contiguous().numpy()
+        got = f"{volume}" if stored is None else f"{stored} for {volume}"
+        raise VolumeFileError(path, f"samples (D, H, W) of a type among {', '.join(types)}", got)
+    return exactly(path, samples.contiguous().numpy(), name)
+
+
+def exactly(path: Path, array: np.ndarray, name: str | None) -> np.ndarray:
+    """The same numbers in another type (None: their own). Raises VolumeFileError where it does not hold them all."""
+    if name is None or array.dtype.name == name:
+        return array
+    dtype = np.dtype(name)
+    with np.errstate(invalid="ignore", over="ignore"):
+        converted = array.astype(dtype)
+        back = converted.astype(array.dtype)
+    kept = (back == array) | ((back != back) & (array != array))  # a NaN stays one
+    if dtype.kind in "iu":
+        kept &= (array >= np.iinfo(dtype).min) & (array <= np.iinfo(dtype).max)
+    elif array.dtype.kind in "iu":
+        kept &= np.abs(array.astype(np.float64)) <= 2.0 ** (np.finfo(dtype).nmant + 1)
+    if not kept.all():
+        raise VolumeFileError(path, f"samples that {name} holds exactly", f"{array[~kept].flat[0]}")
+    return converted
 
 
 def rescaled(array: np.ndarray, slope: float, intercept: float, dtype: torch.dtype) -> Tensor:

@@ -351,8 +351,19 @@ def _override(document: _Document, model: type[BaseModel], key: str, text: str) 
         elif isinstance(target, dict) and target.get(part) is None:
             target[part] = _default(model, parents)
             document.places[parents] = place
+        elif isinstance(target, dict):
+            target[part] = _unfolded(model, parents, target[part])
         target = target[part]
     document.places[keys] = place
+
+
+def _unfolded(model: type[BaseModel], path: KeyPath, value: Any) -> Any:
+    """A section that stands as a bare name, with its key (`bare` of its model), so that another key can be set."""
+    if isinstance(value, str):
+        for owner in _types_at(model, path):
+            if _is_model(owner) and hasattr(owner, "bare"):
+                return {owner.bare: value}  # type: ignore[attr-defined]
+    return value
 
 
 def _override_value(text: str, place: str, key: str) -> Any:

@@ -1,8 +1,10 @@
 """NIfTI volumes (`.nii`, `.nii.gz`), NIfTI-1 and -2, with nibabel reading the header (the extra `medical`).
 
-World coordinates are the file's: right, anterior, superior (RAS), from the sform if it is set, else the qform, else the
-voxel sizes. scl_slope and scl_inter are applied; the result is then float32 (float64 where 32 or 64 bits are stored).
-The voxels are read by our own bounded reader, never by nibabel. Of a time series (4-D), one frame is read.
+World coordinates are the file's: right, anterior, superior (RAS), from the sform if it is set and not zero, else the
+qform, else the voxel sizes. scl_slope and scl_inter are applied; the result is then float32 (float64 where 32 or 64
+bits are stored). The voxels are read by our own bounded reader, never by nibabel. Of a time series (the fourth axis),
+one frame is read; of vectors (the fifth) and colours, one channel. A volume that was read is written in its file's
+version, with its codes and units.
 
 Source: https://nifti.nimh.nih.gov/nifti-1 and the headers nifti1.h, nifti2.h.
 """
@@ -13,15 +15,16 @@ import gzip
 import io
 import math
 import warnings
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
 
 from filterlab.io.bounded import (
-    BLOCK,
+    Choice,
     Stored,
     VolumeFileError,
     VolumeHeader,
@@ -29,18 +32,22 @@ from filterlab.io.bounded import (
     check_geometry,
     check_size,
     damaged,
-    decompressed,
-    native,
     rescaled,
     sample_dtype,
-    skip_bytes,
     storable,
 )
 from filterlab.volume import Volume
+from filterlab.world import RAS, NiftiForms, World
 
 MAX_NIFTI1_AXIS = 32767
 HEADER_BYTES = {348: 352, 540: 544}  # sizeof_hdr -> bytes up to the first possible voxel
-_WRITTEN = ("uint8", "int8", "int16", "int32", "int64", "float32", "float64")
+_WRITTEN = (
+    *("uint8", "int8", "int16", "uint16", "int32", "uint32", "int64", "uint64"),
+    *("float32", "float64"),
+)
+_UNITS = {"meter": "m", "mm": "mm", "micron": "um"}
+_COLOURS = {128: 3, 2304: 4}  # data types RGB24 and RGBA32: bytes, one per channel
+_LABELS = 1002  # the intent of a volume whose numbers are names
 
 
 def require_nibabel(path: Path) -> Any:
@@ -54,11 +61,8 @@ def require_nibabel(path: Path) -> Any:
     return nibabel
 
 
-def read_header(path: Path, frame: int | None = None) -> VolumeHeader:
-    """The checked header of a NIfTI file; of a time series, that of one frame, counted from 0.
-
-    Raises VolumeFileError: also for a time series without a frame, a frame that it has not, or one of a 3-D file.
-    """
+def read_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
+    """The checked header of a NIfTI file. Raises VolumeFileError: also for a frame or channel that it has not."""
     nibabel = require_nibabel(path)
     compressed = path.name.lower().endswith(".gz")
     block = _first_bytes(path, compressed)
@@ -71,7 +75,7 @@ def read_header(path: Path, frame: int | None = None) -> VolumeHeader:
         warnings.simplefilter("ignore")
         try:
             header = cls(block[:kind], endianness="<" if kind == little else ">", check=False)
-            return _checked(path, header, kind, compressed, frame)
+            return _checked(path, header, kind, compressed, (frame, channel))
         except VolumeFileError:
             raise
         except Exception as error:  # whatever nibabel makes of damaged fields
@@ -85,102 +89,107 @@ def _first_bytes(path: Path, compressed: bool) -> bytes:
             return stream.read(max(HEADER_BYTES.values()))
 
 
-def _checked(path: Path, header: Any, kind: int, compressed: bool, frame: int | None) -> VolumeHeader:
+def _checked(
+    path: Path, header: Any, kind: int, compressed: bool, asked: tuple[int | None, int | None]
+) -> VolumeHeader:
     magic = bytes(header["magic"].tobytes())
     if not magic.startswith((b"n+1", b"n+2")):
         raise VolumeFileError(path, "a single NIfTI file (magic n+1 or n+2)", repr(magic))
-    size, frames = _size(path, [int(n) for n in header["dim"]])
-    index = _frame(path, frames, frame)
-    try:
-        dtype = header.get_data_dtype()
-    except Exception:
-        raise VolumeFileError(path, "a known data type", f"code {int(header['datatype'])}") from None
+    size, frames, vectors = _size(path, [int(n) for n in header["dim"]])
+    dtype, colours = _dtype(path, header)
     stored_dtype = sample_dtype(path, dtype)
-    if int(header["bitpix"]) != 8 * dtype.itemsize:
-        raise VolumeFileError(path, f"bitpix {8 * dtype.itemsize} for {dtype.name}", int(header["bitpix"]))
     offset = float(header["vox_offset"])
     if not math.isfinite(offset) or offset != int(offset) or not HEADER_BYTES[kind] <= offset < 2**62:
         raise VolumeFileError(path, f"a vox_offset of at least {HEADER_BYTES[kind]}", offset)
+    if vectors > 1 and colours > 1:
+        raise VolumeFileError(path, "vectors or colours", f"{vectors} of {colours} values")
     start = int(offset)
     stored = Stored(
         *(path, path, "gzip" if compressed else "raw"), 0 if compressed else start, start if compressed else 0,
-        *((frames or 1, *size[::-1]), dtype),
+        *((vectors, frames, *size[::-1], colours), dtype),
     )  # fmt: skip
     stored.check()
-    slope, intercept = _scaling(path, header)
+    choice = Choice.of(path, frames, vectors * colours, *asked)
+    t, c = choice.place
+    at = (0 if colours > 1 else c, t, None, None, None, c if colours > 1 else 0)
+    slope, intercept = (1.0, 0.0) if colours > 1 else _scaling(path, header)
     plain = (slope, intercept) == (1.0, 0.0)
     wide = torch.float64 if dtype.itemsize > 2 and dtype.name != "float32" else torch.float32
     target = stored_dtype if plain else wide
+    affine, world, source = _place(header, kind)
     return VolumeHeader(
         path,
         "NIfTI",
         size[::-1],
         dtype.name,
-        check_geometry(path, header.get_best_affine()),
+        check_geometry(path, affine, world),
         stored.encoding,
-        "RAS",
-        _fields(header, slope, intercept) | ({"frame": f"{index} of {frames}"} if frame is not None else {}),
+        _fields(header, source, slope, intercept),
         target,
+        choice,
+        stored.held(at),
         lambda: (
-            as_tensor(_read_frame(stored, index), target)
-            if plain
-            else rescaled(_read_frame(stored, index), slope, intercept, target)
+            as_tensor(path, stored.read(at), target) if plain else rescaled(stored.read(at), slope, intercept, target)
         ),
     )
 
 
-def _size(path: Path, dim: list[int]) -> tuple[tuple[int, ...], int | None]:
-    """Voxels along x, y, z, and how many frames there are: None for a file without a time axis."""
+def _size(path: Path, dim: list[int]) -> tuple[tuple[int, ...], int, int]:
+    """Voxels along x, y, z, frames, and values per voxel."""
     rank = dim[0]
     if not 1 <= rank <= 7:
         raise VolumeFileError(path, "dim[0], the number of axes, from 1 to 7", rank)
     size = check_size(path, dim[1 : rank + 1])
-    if rank < 3 or any(n != 1 for n in size[4:]):
-        expected = "three axes of one value per voxel, or four of a time series (no images, no channels)"
-        raise VolumeFileError(path, expected, f"sizes {size}")
-    return size[:3], size[3] if rank > 3 else None
+    if rank < 3 or any(n != 1 for n in size[5:]):
+        raise VolumeFileError(path, "three axes of space, then time, then the values of a voxel", f"sizes {size}")
+    frames, vectors = (*size[3:5], 1, 1)[:2]
+    return size[:3], frames, vectors
 
 
-def _frame(path: Path, frames: int | None, frame: int | None) -> int:
-    """Which frame to read of so many (None: no time axis). Raises VolumeFileError."""
-    if frame is None:
-        if frames is not None and frames > 1:
-            expected = f"a choice among its {frames} frames, frame=0 to frame={frames - 1}: this is a time series"
-            raise VolumeFileError(path, expected, "none")
-        return 0
-    if frames is None:
-        raise VolumeFileError(path, "no frame, because it has three axes and no time", f"frame {frame!r}")
-    if not isinstance(frame, int) or isinstance(frame, bool) or not 0 <= frame < frames:
-        raise VolumeFileError(path, f"a frame from 0 to {frames - 1}", f"frame {frame!r}")
-    return frame
+def _dtype(path: Path, header: Any) -> tuple[np.dtype, int]:
+    """The type of one value, and how many a voxel of colours has."""
+    colours = _COLOURS.get(int(header["datatype"]), 1)
+    try:
+        dtype = header.get_data_dtype() if colours == 1 else np.dtype(np.uint8)
+    except Exception:
+        raise VolumeFileError(path, "a known data type", f"code {int(header['datatype'])}") from None
+    bits = 8 * dtype.itemsize * colours
+    if int(header["bitpix"]) != bits:
+        raise VolumeFileError(path, f"bitpix {bits} for {dtype.name}", int(header["bitpix"]))
+    return dtype, colours
 
 
-def _read_frame(series: Stored, frame: int) -> np.ndarray:
-    """One volume (D, H, W) of `series`, (T, D, H, W). All is passed over, so that damage anywhere is found."""
-    if series.shape[0] == 1:
-        return series.read()[0]
-    series.check()
-    count = series.nbytes // series.shape[0]
-    with series.file.open("rb") as file:
-        file.seek(series.offset)
-        with damaged(series.header, f"{series.encoding} data of {series.nbytes} bytes"):
-            stream = decompressed(file, series.encoding)
-            skip_bytes(series.header, stream, series.skip + frame * count)
-            buffer = _exactly(series.header, stream, count)
-            skip_bytes(series.header, stream, (series.shape[0] - 1 - frame) * count)
-            if stream.read(1):
-                raise VolumeFileError(series.header, f"{series.nbytes} bytes of samples", "more than that")
-    return native(buffer, series.dtype, series.shape[1:])
+def _place(header: Any, kind: int) -> tuple[np.ndarray, World, str]:
+    """The affine, what is declared of the world, and where the affine comes from."""
+    sform, qform = int(header["sform_code"]), int(header["qform_code"])
+    if sform > 0 and not np.any(header.get_sform()[:3, :3]):  # declared, and left empty
+        sform = 0
+    unit, time = header.get_xyzt_units()
+    affine = header.get_sform() if sform > 0 else header.get_qform() if qform > 0 else header.get_base_affine()
+    other = None
+    if sform > 0 and qform > 0:
+        qform, other = _other_place(header, affine, qform)
+    source = "sform" if sform > 0 else "qform" if qform > 0 else "voxel sizes"
+    nifti = NiftiForms(1 if kind == 348 else 2, max(sform, 0), max(qform, 0), time, other)
+    return affine, World(RAS, _UNITS.get(unit), nifti), source
 
 
-def _exactly(path: Path, stream: BinaryIO, count: int) -> bytearray:
-    """The next `count` bytes; memory grows with what is really there."""
-    buffer = bytearray()
-    while len(buffer) < count and (block := stream.read(min(BLOCK, count - len(buffer)))):
-        buffer += block
-    if len(buffer) < count:
-        raise VolumeFileError(path, f"{count} bytes of samples", f"the end of the data after {len(buffer)}")
-    return buffer
+def _other_place(header: Any, affine: np.ndarray, code: int) -> tuple[int, tuple[tuple[float, ...], ...] | None]:
+    """The code of a qform beside an sform (0 where it is damaged), and where it leads to, where that is elsewhere."""
+    try:
+        place = header.get_qform()
+        if _same_place(affine, place, header["dim"][1:4]):
+            return code, None
+        return code, tuple(map(tuple, (place @ np.linalg.inv(affine)).tolist()))
+    except (ValueError, np.linalg.LinAlgError):
+        return 0, None
+
+
+def _same_place(first: np.ndarray, second: np.ndarray, size: Sequence[int]) -> bool:
+    """Whether two affines put every voxel within 1e-4 of a voxel of the same place."""
+    corners = np.array([[x, y, z, 1] for x in (0, size[0]) for y in (0, size[1]) for z in (0, size[2])], np.float64)
+    finest = np.sqrt((first[:3, :3] ** 2).sum(axis=0).min())
+    return bool(np.abs(corners @ (first - second).T).max() <= 1e-4 * finest)
 
 
 def _scaling(path: Path, header: Any) -> tuple[float, float]:
@@ -193,12 +202,15 @@ def _scaling(path: Path, header: Any) -> tuple[float, float]:
     return slope, intercept
 
 
-def _fields(header: Any, slope: float, intercept: float) -> dict[str, str]:
+def _fields(header: Any, source: str, slope: float, intercept: float) -> dict[str, str]:
     fields = {
         "description": bytes(header["descrip"].tobytes()).split(b"\0")[0].decode("latin-1"),
-        "units": header.get_xyzt_units()[0],
-        "affine from": "sform" if header["sform_code"] > 0 else "qform" if header["qform_code"] > 0 else "voxel sizes",
+        "affine from": source,
     }
+    if source == "qform" and header["sform_code"] > 0:
+        fields["affine from"] = "qform (the sform is zero)"
+    if int(header["intent_code"]) == _LABELS:
+        fields["intent"] = "labels"
     if (slope, intercept) != (1.0, 0.0):
         fields["scaling"] = f"{slope} · stored + {intercept}"
     return {k: v for k, v in fields.items() if v}
@@ -221,21 +233,26 @@ def fits_nifti1(volume: Volume) -> bool:
     return max(volume.size) <= MAX_NIFTI1_AXIS and rounding(volume.affine) <= 2**-24
 
 
-def write(volume: Volume, path: Path, nifti2: bool = False) -> None:
-    """Writes `.nii` or `.nii.gz` with an sform: NIfTI-1, which every tool opens, with the nearest float32 affine.
+def version_for(volume: Volume, nifti2: bool = False) -> int:
+    """1, or 2 where that is asked for, where the volume comes from NIfTI-2, or where NIfTI-1 cannot hold it."""
+    forms = volume.world.nifti
+    return 2 if nifti2 or (forms is not None and forms.version == 2) or not fits_nifti1(volume) else 1
 
-    NIfTI-2, which holds the affine bit for bit, where it is asked for or NIfTI-1 cannot hold the volume (see
-    `fits_nifti1`). float16 and bfloat16, which the format lacks, become float32.
+
+def write(volume: Volume, path: Path, stored: str | None = None, nifti2: bool = False) -> None:
+    """Writes `.nii` or `.nii.gz`: NIfTI-1, which every tool opens, with the nearest float32 affine.
+
+    NIfTI-2, which holds the affine bit for bit, as `version_for` says. A volume that comes from a NIfTI file keeps its
+    codes and units; others have an sform, "aligned". float16 and bfloat16, which the format lacks, become float32.
     """
     nibabel = require_nibabel(path)
-    array = storable(path, volume, _WRITTEN)
-    affine = volume.affine
-    first = not nifti2 and fits_nifti1(volume)
+    array = storable(path, volume, _WRITTEN, stored)
+    first = version_for(volume, nifti2) == 1
     header = nibabel.Nifti1Header() if first else nibabel.Nifti2Header()
     header.set_data_shape(volume.size)
     header.set_data_dtype(array.dtype)
     header.set_zooms(volume.spacing)
-    header.set_sform(affine, code="aligned")
+    _set_place(header, volume)
     header["magic"] = b"n+1" if first else b"n+2\0\r\n\x1a\n"
     header["vox_offset"] = HEADER_BYTES[348 if first else 540]
     front = io.BytesIO()
@@ -248,3 +265,16 @@ def write(volume: Volume, path: Path, nifti2: bool = False) -> None:
         stream.write(start)
         for plane in array:
             stream.write(plane.data)
+
+
+def _set_place(header: Any, volume: Volume) -> None:
+    """Forms, codes and units; a form that cannot hold the affine gives way to an sform of the same code."""
+    world, affine = volume.world, volume.affine
+    forms = world.nifti or NiftiForms()
+    header.set_xyzt_units(next((k for k, v in _UNITS.items() if v == world.unit), "unknown"), forms.time)
+    place = affine if forms.to_qform is None else np.array(forms.to_qform) @ affine
+    if forms.qform > 0:
+        header.set_qform(place, forms.qform, strip_shears=True)
+    held = header.get_qform() if forms.qform > 0 else header.get_base_affine()
+    if forms.sform > 0 or not _same_place(affine, held, volume.size):
+        header.set_sform(affine, code=forms.sform or forms.qform or "aligned")

@@ -18,6 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
 
@@ -30,13 +31,16 @@ from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import (
     BLOCK,
     EXPANSION,
+    Choice,
     Stored,
     VolumeFileError,
     VolumeHeader,
     as_tensor,
     check_geometry,
     check_size,
+    exactly,
     native,
+    read_array,
     read_exactly,
     regular_file,
     sample_dtype,
@@ -101,7 +105,41 @@ def _stored_order(shape: tuple[int, ...], fortran: bool) -> tuple[int, ...]:
     return shape[::-1] if fortran else shape
 
 
-def read_npy_header(path: Path) -> VolumeHeader:
+@dataclass(frozen=True)
+class Part:
+    """What is read of an array (D, H, W) or (N, C, D, H, W): all of it, or one entry, one channel, or both.
+
+    Attributes:
+        choice: of the N frames and C channels.
+        at: for each axis as it is stored, the index that is read of it; None: all of it.
+        shape: of what is read.
+        fortran: the array is stored with its axes turned round.
+    """
+
+    choice: Choice
+    at: tuple[int | None, ...]
+    shape: tuple[int, ...]
+    fortran: bool
+
+    @classmethod
+    def of(cls, path: Path, shape: tuple[int, ...], fortran: bool, frame: int | None, channel: int | None) -> Part:
+        """The part with that frame and channel. Raises VolumeFileError where it is not there."""
+        n, c = shape[:-3] or (1, 1)
+        choice = Choice.of(path, n, c, frame, channel)
+        at: tuple[int | None, ...] = (None,) * len(shape)
+        if len(shape) == 5 and (frame, channel) != (None, None):
+            first, second = (0 if count == 1 else index for index, count in ((frame, n), (channel, c)))
+            at = (first, second, None, None, None)
+            batch = (n if first is None else 1, c if second is None else 1)
+            shape = (*batch, *shape[2:]) if None in (first, second) else shape[2:]
+        return cls(choice, at[::-1] if fortran else at, shape, fortran)
+
+    def tensor(self, path: Path, array: np.ndarray, target: torch.dtype) -> Tensor:
+        """What was read, its axes the right way round."""
+        return as_tensor(path, (array.T if self.fortran else array).reshape(self.shape), target)
+
+
+def read_npy_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
     """The checked header of an .npy file (and of its sidecar). Raises VolumeFileError."""
     with path.open("rb") as file:
         shape, fortran, dtype = _array_header(path, file)
@@ -109,15 +147,20 @@ def read_npy_header(path: Path) -> VolumeHeader:
     shape, target = _check_shape(path, shape), sample_dtype(path, dtype)
     stored = Stored(path, path, "raw", offset, 0, _stored_order(shape, fortran), dtype)
     stored.check()
-    affine = _sidecar_affine(path, shape)
-
-    def read() -> Tensor:
-        array = stored.read()
-        return as_tensor(array.T if fortran else array, target)
-
-    fields = {"order": "Fortran"} if fortran else {}
-    geometry = check_geometry(path, affine)
-    return VolumeHeader(path, "npy", shape, dtype.name, geometry, "raw", None, fields, target, read)
+    affine, part = _sidecar_affine(path, shape), Part.of(path, shape, fortran, frame, channel)
+    return VolumeHeader(
+        path,
+        "npy",
+        part.shape,
+        dtype.name,
+        check_geometry(path, affine),
+        "raw",
+        {"order": "Fortran"} if fortran else {},
+        target,
+        part.choice,
+        stored.held(part.at),
+        lambda: part.tensor(path, stored.read(part.at), target),
+    )
 
 
 def _sidecar_affine(path: Path, shape: tuple[int, ...]) -> np.ndarray:
@@ -182,7 +225,7 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Bina
     return archive.open(info)  # type: ignore[return-value]
 
 
-def read_npz_header(path: Path) -> VolumeHeader:
+def read_npz_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
     """The checked header of an .npz file. Raises VolumeFileError."""
     with _archive(path) as (archive, members):
         name = _samples_name(path, members)
@@ -196,18 +239,26 @@ def read_npz_header(path: Path) -> VolumeHeader:
             expected = f"{claimed} bytes of samples for {shape} {dtype.name} in {info.filename}"
             raise VolumeFileError(path, expected, f"{info.file_size - offset}")
         affine = _npz_affine(path, archive, members)
+    part = Part.of(path, shape, fortran, frame, channel)
 
     def read() -> Tensor:
         with _archive(path) as (archive, _), _member(path, archive, info) as stream:
             stream.read(offset)
-            buffer = read_exactly(path, stream, claimed, exact_length=False)
-            array = native(buffer, dtype, _stored_order(shape, fortran))
-        return as_tensor(array.T if fortran else array, target)
+            array = read_array(path, stream, _stored_order(shape, fortran), dtype, part.at, raw=False)
+        return part.tensor(path, array, target)
 
-    encoding = "deflate" if info.compress_type == zipfile.ZIP_DEFLATED else "raw"
-    fields = {"array": name} | ({"order": "Fortran"} if fortran else {})
     return VolumeHeader(
-        path, "npz", shape, dtype.name, check_geometry(path, affine), encoding, None, fields, target, read
+        path,
+        "npz",
+        part.shape,
+        dtype.name,
+        check_geometry(path, affine),
+        "deflate" if info.compress_type == zipfile.ZIP_DEFLATED else "raw",
+        {"array": name} | ({"order": "Fortran"} if fortran else {}),
+        target,
+        part.choice,
+        math.prod(shape),
+        read,
     )
 
 
@@ -228,7 +279,7 @@ def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile
             found, fortran, dtype = _array_header(path, stream)
             if found != shape or dtype.kind not in "fiu" or dtype.itemsize > 8:
                 raise VolumeFileError(path, f"numbers of shape {shape} as {name}", f"{dtype} of shape {found}"[:100])
-            buffer = read_exactly(path, stream, math.prod(shape) * dtype.itemsize, exact_length=False)
+            buffer = read_exactly(path, stream, math.prod(shape) * dtype.itemsize, allocate=False)
         array = native(buffer, dtype, _stored_order(shape, fortran)).astype(np.float64)
         return array.T if fortran else array
 
@@ -245,15 +296,15 @@ def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def _array(volume: Volume) -> np.ndarray:
+def _array(path: Path, volume: Volume, stored: str | None) -> np.ndarray:
     samples = volume.samples.detach().cpu().contiguous()
-    return (samples.float() if samples.dtype == torch.bfloat16 else samples).numpy()
+    return exactly(path, (samples.float() if samples.dtype == torch.bfloat16 else samples).numpy(), stored)
 
 
-def write_npy(volume: Volume, path: Path) -> None:
+def write_npy(volume: Volume, path: Path, stored: str | None = None) -> None:
     """Writes the samples; bfloat16 becomes float32. The geometry is written by `write_sidecar`."""
     with path.open("wb") as file:
-        write_array(file, _array(volume))
+        write_array(file, _array(path, volume, stored))
         file.flush()
         os.fsync(file.fileno())  # a full disk may tell only now, and must before `write_sidecar`
 
@@ -293,9 +344,9 @@ def _described(volume: Volume) -> str | None:
     return dump_config(GeometrySidecar(size=volume.size, affine=affine))  # type: ignore[arg-type]
 
 
-def write_npz(volume: Volume, path: Path) -> None:
+def write_npz(volume: Volume, path: Path, stored: str | None = None) -> None:
     """Writes `samples` and `affine`, compressed; bfloat16 becomes float32."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-        for name, data in (("samples", _array(volume)), ("affine", volume.affine)):
+        for name, data in (("samples", _array(path, volume, stored)), ("affine", volume.affine)):
             with archive.open(name + _SUFFIX, "w", force_zip64=True) as stream:
                 write_array(stream, data)  # type: ignore[arg-type]

@@ -20,6 +20,7 @@ from pydantic import Field, model_validator
 
 from filterlab.io.bounded import (
     SAMPLE_TYPES,
+    Choice,
     Stored,
     VolumeFileError,
     VolumeHeader,
@@ -61,7 +62,7 @@ class RawSidecar(StrictModel):
         return self
 
 
-def read_header(path: Path) -> VolumeHeader:
+def read_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
     """The checked sidecar of raw samples; `path` is either of the two files. Raises VolumeFileError."""
     sidecar = path if path.name.lower().endswith(".yaml") else path.with_name(path.name + ".yaml")
     if not sidecar.exists():
@@ -76,7 +77,7 @@ def read_header(path: Path) -> VolumeHeader:
     size = check_size(sidecar, found.size)
     dtype = np.dtype(found.dtype).newbyteorder(">" if found.byte_order == "big" else "<")
     stored = Stored(sidecar, data, "raw", found.offset, 0, size[::-1], dtype)
-    stored.check()
+    stored.check(exact=True)  # nothing else tells a wrong size or type
     affine = np.array(found.affine) if found.affine else scaled(found.spacing or (1, 1, 1), found.origin or (0, 0, 0))
     target = sample_dtype(sidecar, dtype)
     fields = {"file": data.name, "byte order": found.byte_order or "-", "offset": str(found.offset)}
@@ -87,8 +88,9 @@ def read_header(path: Path) -> VolumeHeader:
         dtype.name,
         check_geometry(sidecar, affine),
         "raw",
-        None,
         fields,
         target,
-        lambda: as_tensor(stored.read(), target),
+        Choice.of(path, 1, 1, frame, channel),
+        0,
+        lambda: as_tensor(path, stored.read(), target),
     )

@@ -1,67 +1,98 @@
 """TIFF stacks: one file of many pages, or a folder of numbered slices (`slice2.tif` before `slice10.tif`).
 
-Every page is one z-plane of one value per pixel; all have the same size and type. Uncompressed and deflate data, strips
-or tiles, with any predictor. World coordinates are voxel indices; a file by ImageJ or Fiji also tells voxel sizes, and
-they are used. Of its stacks beyond 4 GB only the first plane has a page; the others lie behind it.
+All pages have the same size and type. Uncompressed and deflate data, strips or tiles, with any predictor, are read by
+ourselves, other compressions by tifffile (the extra `tiff`). What a page is, slice, channel or frame, and how large a
+voxel is, `tiff_layouts` finds in what OME, ImageJ and tifffile write; else pages are slices, and world coordinates are
+voxel indices. The values of a pixel (RGB) are channels. Of ImageJ's stacks beyond 4 GB only the first plane has a page;
+the others lie behind it.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from filterlab.io.bounded import (
+    Choice,
     VolumeFileError,
     VolumeHeader,
+    as_tensor,
     check_geometry,
     check_size,
-    integer,
-    number,
     regular_file,
     sample_dtype,
     scaled,
 )
+from filterlab.io.tiff_layouts import MAX_OME, FirstPage, Layout
 from filterlab.io.tiff_pages import DESCRIPTION, Page, TiffFile
+from filterlab.world import World
 
 SUFFIXES = (".tif", ".tiff")
 
 
-def read_header(path: Path) -> VolumeHeader:
+def read_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
     """The checked header of a multi-page file or of a folder of slices. Raises VolumeFileError."""
     files = slices(path) if path.is_dir() else [regular_file(path)]
     first: Page | None = None
-    planes, entries, size = 0, {}, (1.0, 1.0)
+    told: FirstPage | None = None
+    planes = 0
     for file in files:
         before = planes
         for page in _pages(file):
             if first is None:
-                first, entries, size = page, _entries(page), page.size
+                first, told = page, _told(page)
+                page.directory.check_vendor()
             if page.plane != first.plane:
                 raise VolumeFileError(file, f"pages of {first.plane}", f"page {planes} of {page.plane}")
             planes += 1
         if path.is_dir() and planes != before + 1:
             raise VolumeFileError(file, "one page in every slice of a folder", planes - before)
-    fields, spacing = _imagej(path, entries, size, planes)
-    if first is None or planes < 2:
+    if first is None or told is None:
+        raise VolumeFileError(path, "a stack of two or more pages", "none")
+    layout, plane = _layout(told, planes, len(files)), first.plane
+    if planes < 2:
         raise VolumeFileError(path, "a stack of two or more pages", f"{planes} (a 2-D image)")
-    plane = first.plane
-    shape = check_size(path, (planes, plane.rows, plane.columns))
+    frames, groups, depth = layout.pages.shape
+    if depth < 2:
+        got = f"{frames} frames of {groups * plane.samples} channels of a 2-D image"
+        raise VolumeFileError(path, "a stack of two or more slices", got)
+    shape = check_size(path, (depth, plane.rows, plane.columns))
     target = sample_dtype(path, plane.dtype)
+    choice = Choice.of(path, frames, groups * plane.samples, frame, channel)
+    t, c = choice.place
+    group, sample = divmod(c, plane.samples)
+    wanted = {int(page): z for z, page in enumerate(layout.pages[t, group])}
     return VolumeHeader(
         path,
         "TIFF",
         shape,
         plane.dtype.name,
-        check_geometry(path, scaled(spacing, (0, 0, 0))),
+        check_geometry(path, scaled(layout.spacing, (0, 0, 0)), World(unit=layout.unit)),
         plane.encoding,
-        None,
-        fields | ({"files": str(len(files))} if path.is_dir() else {}),
+        layout.fields | first.directory.remarks() | ({"files": str(len(files))} if path.is_dir() else {}),
         target,
-        lambda: _read(files, shape, target),
+        choice,
+        0,
+        lambda: _read(files, shape, target, wanted, sample),
     )
+
+
+def _told(page: Page) -> FirstPage:
+    plane, file = page.plane, page.directory.file
+    text = page.directory.text(DESCRIPTION, MAX_OME)
+    return FirstPage(file.path, text, plane.samples, page.size, (plane.rows, plane.columns))
+
+
+def _layout(told: FirstPage, planes: int, files: int) -> Layout:
+    """That of one file; of a folder, whose slices each have a description of their own, one slice behind the other."""
+    if files == 1:
+        return told.layout(planes)
+    one = told.layout(1)
+    return Layout(np.arange(planes).reshape(1, 1, planes), one.spacing, one.unit, one.fields)
 
 
 def slices(folder: Path) -> list[Path]:
@@ -84,42 +115,17 @@ def _pages(path: Path) -> Iterator[Page]:
         for index, directory in enumerate(TiffFile(path, stream)):
             page = directory.page()
             yield page
-            if index == 0 and directory.last:
-                yield from page.behind(_images(path, _entries(page), 1) - 1)
+            if index == 0 and directory.last and directory.text(DESCRIPTION).startswith("ImageJ="):
+                yield from page.behind(_told(page).images(1) - 1)
 
 
-def _read(files: list[Path], shape: tuple[int, ...], target: torch.dtype) -> torch.Tensor:
+def _read(
+    files: list[Path], shape: tuple[int, ...], target: torch.dtype, wanted: Mapping[int, int], sample: int
+) -> torch.Tensor:
+    """The slices that are wanted, page -> slice, each of one of the values of its pixels."""
     samples = torch.empty(shape, dtype=target)
     pages = (page for file in files for page in _pages(file))
-    for plane, page in zip(samples.numpy(), pages, strict=True):
-        plane[...] = page.read()
+    for index, page in enumerate(pages):
+        if index in wanted:
+            samples[wanted[index]] = as_tensor(page.directory.file.path, page.read(sample), target)
     return samples
-
-
-# --- ImageJ -----------------------------------------------------------------------------------------------------------
-
-
-def _entries(page: Page) -> dict[str, str]:
-    """What ImageJ says of a stack in the description of its first page: `key=value` lines; empty of other files."""
-    description = page.directory.text(DESCRIPTION)
-    if not description.startswith("ImageJ="):
-        return {}
-    return dict(line.split("=", 1) for line in description.splitlines() if "=" in line)
-
-
-def _images(path: Path, entries: dict[str, str], default: int) -> int:
-    return integer(path, "ImageJ images", entries.get("images", str(default)).strip())
-
-
-def _imagej(
-    path: Path, entries: dict[str, str], size: tuple[float, float], planes: int
-) -> tuple[dict[str, str], tuple[float, float, float]]:
-    """Unit and voxel sizes of an ImageJ stack: width and height from the resolution, depth from `spacing=`."""
-    if not entries:
-        return {}, (1.0, 1.0, 1.0)
-    if _images(path, entries, planes) != planes:
-        raise VolumeFileError(path, f"{entries['images']} pages, as ImageJ says"[:100], planes)
-    if any(entries.get(key, "1") != "1" for key in ("channels", "frames")):
-        raise VolumeFileError(path, "one channel and one frame", f"{entries}"[:100])
-    depth = number(path, "ImageJ spacing", entries.get("spacing", "1").strip())
-    return {"unit": entries["unit"]} if "unit" in entries else {}, (*size, depth)

@@ -12,6 +12,8 @@ Source: TIFF 6.0 (Adobe, 1992), its Technical Note 3 (predictor 3), and the BigT
 
 from __future__ import annotations
 
+import importlib.util
+import math
 import os
 import struct
 import zlib
@@ -24,45 +26,76 @@ from typing import BinaryIO
 import numpy as np
 
 from filterlab.io.bounded import BLOCK, EXPANSION, SAMPLE_TYPES, VolumeFileError, check_size, sample_dtype
+from filterlab.io.warned import warn
 
 MAX_PAGES = 2**20
 MAX_TAGS = 2**12
 MAX_TEXT = 10_000
 MAX_SEGMENT = 2**26
+MAX_SAMPLES = 2**12
 SHARING = 4  # how often what pages claim may be read anew, because they share strips or pad their tiles
 OVERHEAD = 16  # bytes of deflate data that hold nothing
 
 WIDTH, LENGTH, BITS, COMPRESSION, FILL_ORDER, DESCRIPTION = 256, 257, 258, 259, 266, 270
 STRIP_OFFSETS, SAMPLES_PER_PIXEL, ROWS_PER_STRIP, STRIP_COUNTS = 273, 277, 278, 279
-X_RESOLUTION, Y_RESOLUTION, PREDICTOR = 282, 283, 317
+X_RESOLUTION, Y_RESOLUTION, PLANAR, PREDICTOR = 282, 283, 284, 317
+SUBFILE, PHOTOMETRIC, ORIENTATION = 254, 262, 274
 TILE_WIDTH, TILE_LENGTH, TILE_OFFSETS, TILE_COUNTS, SAMPLE_FORMAT = 322, 323, 324, 325, 339
 DEPTH, TILE_DEPTH = 32997, 32998
 _WANTED = {WIDTH, LENGTH, BITS, COMPRESSION, FILL_ORDER, DESCRIPTION, STRIP_OFFSETS, SAMPLES_PER_PIXEL, ROWS_PER_STRIP}
 _WANTED |= {STRIP_COUNTS, X_RESOLUTION, Y_RESOLUTION, PREDICTOR, TILE_WIDTH, TILE_LENGTH, TILE_OFFSETS, TILE_COUNTS}
-_WANTED |= {SAMPLE_FORMAT, DEPTH, TILE_DEPTH}
+_WANTED |= {SAMPLE_FORMAT, DEPTH, TILE_DEPTH, PLANAR, SUBFILE, PHOTOMETRIC, ORIENTATION}
 _TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 _WHOLE = {1: "u1", 3: "u2", 4: "u4", 13: "u4", 16: "u8", 18: "u8"}  # types of tags that are whole numbers
 _KINDS = {1: "u", 2: "i", 3: "f", 4: "u", 6: "c"}  # sample formats; 4 is "undefined": whole numbers
 _COMPRESSIONS = {1: "raw", 8: "deflate", 32946: "deflate"}
-_NAMES = {2: "CCITT", 3: "CCITT", 4: "CCITT", 5: "LZW", 6: "JPEG", 7: "JPEG", 32773: "PackBits", 34712: "JPEG 2000"}
-_NAMES |= {34887: "LERC", 34925: "LZMA", 50000: "Zstandard", 50001: "WebP", 50002: "JPEG XL"}
+# What tifffile reads with the codecs of the package imagecodecs.
+_CODED = {5: "LZW", 6: "JPEG", 7: "JPEG", 32773: "PackBits", 33003: "JPEG 2000", 33004: "JPEG 2000", 33005: "JPEG 2000"}
+_CODED |= {34712: "JPEG 2000", 34887: "LERC", 34892: "JPEG", 34925: "LZMA", 34926: "Zstandard", 34927: "WebP"}
+_CODED |= {34933: "PNG", 34934: "JPEG XR", 50000: "Zstandard", 50001: "WebP", 50002: "JPEG XL", 52546: "JPEG XL"}
+_NAMES = {2: "CCITT", 3: "CCITT", 4: "CCITT"}
+# Tags of programs that order pages in ways of their own, and of maps.
+_VENDORS = {34412: "LSM", 34361: "FluoView", 33628: "MetaMorph", 33629: "MetaMorph"}
+_GEOGRAPHY = {33550, 33922, 34264}
+_WANTED |= _VENDORS.keys() | _GEOGRAPHY
+_PHOTOMETRIC = {0: "0 is white", 3: "numbers of a palette"}
 
 
 @dataclass(frozen=True)
 class Plane:
-    """What all pages of a stack have in common: rows, columns, type of the samples, encoding (raw or deflate)."""
+    """What all pages of a stack have in common.
+
+    Attributes:
+        rows, columns, dtype: of the values.
+        encoding: raw, deflate, or what tifffile reads.
+        samples: values per pixel.
+        planar: these lie in planes of their own, one behind the other; else next to each other.
+    """
 
     rows: int
     columns: int
     dtype: np.dtype
     encoding: str
+    samples: int = 1
+    planar: bool = False
+
+    @property
+    def own(self) -> bool:
+        """Whether it is read here, and not by tifffile."""
+        return self.encoding in ("raw", "deflate")
+
+    @property
+    def interleaved(self) -> int:
+        """Values of a pixel next to each other."""
+        return 1 if self.planar else self.samples
 
     @property
     def nbytes(self) -> int:
-        return self.rows * self.columns * self.dtype.itemsize
+        return self.rows * self.columns * self.samples * self.dtype.itemsize
 
     def __str__(self) -> str:
-        return f"{self.columns} × {self.rows} {self.dtype.name} ({self.encoding})"
+        samples = f" × {self.samples}" if self.samples > 1 else ""
+        return f"{self.columns} × {self.rows}{samples} {self.dtype.name} ({self.encoding})"
 
 
 @dataclass(frozen=True)
@@ -81,7 +114,7 @@ class Segments:
     tiled: bool
 
     def place(self, plane: Plane, index: int) -> tuple[int, int, int]:
-        """Segment -> its first row, its first column, its rows."""
+        """Segment of a plane -> its first row, its first column, its rows."""
         top, left = divmod(index, -(-plane.columns // self.wide))
         rows = self.high if self.tiled else min(self.high, plane.rows - top * self.high)
         return top * self.high, left * self.wide, rows
@@ -96,16 +129,37 @@ class Page:
     segments: Segments
     directory: Directory
 
-    def read(self) -> np.ndarray:
-        """The values, (rows, columns) in the byte order of the file. Raises VolumeFileError for damaged strips."""
+    def read(self, sample: int = 0) -> np.ndarray:
+        """One of the values of every pixel, (rows, columns) in the byte order of the file.
+
+        Raises VolumeFileError for damaged strips.
+        """
         plane, segments = self.plane, self.segments
+        if not plane.own:
+            return self._decoded()[..., sample]
         values = np.empty((plane.rows, plane.columns), plane.dtype)
-        for index, (at, count) in enumerate(zip(segments.offsets.tolist(), segments.counts.tolist(), strict=True)):
+        places = list(zip(segments.offsets.tolist(), segments.counts.tolist(), strict=True))
+        if plane.planar:
+            count = len(places) // plane.samples
+            places, sample = places[sample * count : (sample + 1) * count], 0
+        for index, (at, count) in enumerate(places):
             top, left, rows = segments.place(plane, index)
-            content = self._content(at, count, rows * segments.wide * plane.dtype.itemsize)
-            block = _unpredicted(content, (rows, segments.wide), plane.dtype, self.predictor)
+            shape = (rows, segments.wide, plane.interleaved)
+            content = self._content(at, count, math.prod(shape) * plane.dtype.itemsize)
+            block = _unpredicted(content, shape, plane.dtype, self.predictor)[..., sample]
             target = values[top : top + rows, left : left + segments.wide]
             target[...] = block[: target.shape[0], : target.shape[1]]
+        return values
+
+    def _decoded(self) -> np.ndarray:
+        """All values of every pixel, (rows, columns, samples), by tifffile and its codecs."""
+        path, plane = self.directory.file.path, self.plane
+        values = decoded_page(path, self.directory.index, plane.encoding)
+        values = values.reshape(values.shape if plane.samples > 1 else (*values.shape[:2], 1))
+        if plane.planar:
+            values = np.moveaxis(values, 0, -1)
+        if values.shape != (plane.rows, plane.columns, plane.samples) or values.dtype.name != plane.dtype.name:
+            raise VolumeFileError(path, f"a page of {plane}", f"{values.shape} {values.dtype.name}")
         return values
 
     @property
@@ -159,19 +213,40 @@ def _inflated(path: Path, file: BinaryIO, at: int, count: int, wanted: int) -> b
     return content
 
 
-def _unpredicted(content: bytes | bytearray, shape: tuple[int, int], dtype: np.dtype, predictor: int) -> np.ndarray:
-    """The values of a strip or tile; 2: every value is stored as the difference from its left neighbour, 3: the bytes
-    of a row are, after all first bytes of its floats come all second ones, and so on."""
+def _unpredicted(
+    content: bytes | bytearray, shape: tuple[int, int, int], dtype: np.dtype, predictor: int
+) -> np.ndarray:
+    """The values of a strip or tile, (rows, columns, values of a pixel).
+
+    2: every value is stored as the difference from its left neighbour's; 3: the bytes of a row are, after all first
+    bytes of its floats come all second ones, and so on.
+    """
     if predictor == 3:
-        rows, columns = shape
-        stored = np.frombuffer(content, np.uint8).reshape(rows, dtype.itemsize * columns)
-        bytewise = np.cumsum(stored, axis=1, dtype=np.uint8).reshape(rows, dtype.itemsize, columns)
-        return np.ascontiguousarray(bytewise.swapaxes(1, 2)).view(dtype.newbyteorder(">"))[..., 0]
+        rows, columns, samples = shape
+        stored = np.frombuffer(content, np.uint8).reshape(rows, -1, samples)
+        bytewise = np.cumsum(stored, axis=1, dtype=np.uint8).reshape(rows, dtype.itemsize, columns * samples)
+        values = np.ascontiguousarray(bytewise.swapaxes(1, 2)).view(dtype.newbyteorder(">"))
+        return values.reshape(shape)
     values = np.frombuffer(content, dtype).reshape(shape)
     if predictor == 1:
         return values
     words = values.view(f"{dtype.byteorder}u{dtype.itemsize}").astype(f"=u{dtype.itemsize}")
     return np.cumsum(words, axis=1, dtype=words.dtype, out=words).view(dtype.newbyteorder("="))
+
+
+def decoded_page(path: Path, index: int, encoding: str) -> np.ndarray:
+    """A page as tifffile reads it. Raises VolumeFileError: also without the codecs."""
+    import tifffile
+
+    if importlib.util.find_spec("imagecodecs") is None:
+        expected = f"imagecodecs, which reads {encoding} data (pip install 'filterlab[tiff]')"
+        raise VolumeFileError(path, expected, "no such package")
+    try:
+        with tifffile.TiffFile(path) as file:
+            return file.pages[index].asarray()
+    except Exception as error:  # whatever codecs make of damaged data
+        got = f"{type(error).__name__}: {error}"[:200]
+        raise VolumeFileError(path, f"intact {encoding} data", got) from None
 
 
 @lru_cache
@@ -202,6 +277,7 @@ class Directory:
     start: int
     entries: bytes
     last: bool
+    index: int = 0
 
     def _bytes(self, at: int, count: int) -> bytes:
         """Bytes of the file; most values stand in the entries themselves, which have been read."""
@@ -239,14 +315,41 @@ class Directory:
         above, below = struct.unpack(self.file.order + "II", _exactly(self.file.stream, at, 8))
         return above / below if above and below else None
 
-    def text(self, tag: int) -> str:
+    def alike(self, tag: int, default: int, count: int) -> int:
+        """One whole number, or the same so many times. Raises VolumeFileError."""
+        if count == 1 or self.tags.get(tag, (0, 1, 0))[1] == 1:
+            return self.number(tag, default)
+        values = set(self.numbers(tag, count).tolist())
+        if len(values) != 1:
+            raise VolumeFileError(self.file.path, f"the same for all {count} values of a pixel in tag {tag}", values)
+        return int(values.pop())
+
+    def check_vendor(self) -> None:
+        """Raises VolumeFileError for pages in an order that only their own program knows; warns of what is not read."""
+        path = self.file.path
+        for tag, name in _VENDORS.items():
+            if tag in self.tags:
+                raise VolumeFileError(path, "a plain TIFF stack, or one by OME, ImageJ or tifffile", f"one of {name}")
+        if _GEOGRAPHY & self.tags.keys():
+            warn(path, "its geography is not read: world coordinates are voxel indices")
+        if (turned := self.number(ORIENTATION, 1)) != 1:
+            warn(path, f"rows and columns are as stored; orientation {turned} is not applied")
+        if self.text(DESCRIPTION).startswith(("SI.", "scanimage.SI.", "state.config")):
+            warn(path, "its pages are taken as slices; ScanImage may have stored channels between them")
+
+    def remarks(self) -> dict[str, str]:
+        """What the tags say of the meaning of values, for people."""
+        meaning = _PHOTOMETRIC.get(self.number(PHOTOMETRIC, 1))
+        return {"photometric": meaning} if meaning else {}
+
+    def text(self, tag: int, most: int = MAX_TEXT) -> str:
         """The beginning of a text; empty where there is none. Raises VolumeFileError."""
         kind, n, at = self.tags.get(tag, (2, 0, 0))
         if kind not in (1, 2, 7) or at + n > self.file.length:
             raise VolumeFileError(
                 self.file.path, f"tag {tag} within its {self.file.length} bytes", f"{n} values at {at}"
             )
-        content = _exactly(self.file.stream, at, min(n, MAX_TEXT)).split(b"\0")[0]
+        content = _exactly(self.file.stream, at, min(n, most)).split(b"\0")[0]
         try:
             return content.decode("utf-8")
         except UnicodeDecodeError:
@@ -258,7 +361,7 @@ class Directory:
         plane = self._plane()
         predictor = self.number(PREDICTOR, 1)
         known = (1, 2, 3) if plane.dtype.kind == "f" else (1, 2)
-        if predictor not in (known if plane.encoding == "deflate" else (1,)):
+        if plane.own and predictor not in (known if plane.encoding == "deflate" else (1,)):
             expected = f"predictor {', '.join(map(str, known))}" if plane.encoding == "deflate" else "no predictor"
             raise VolumeFileError(path, f"{expected} for {plane.dtype.name} ({plane.encoding})", predictor)
         segments = self._segments(plane)
@@ -267,35 +370,40 @@ class Directory:
 
     def _plane(self) -> Plane:
         path = self.file.path
-        channels, depth = self.number(SAMPLES_PER_PIXEL, 1), self.number(DEPTH, 1)
-        if channels != 1 or depth != 1:
-            expected = "pages of one whole number or float per pixel"
-            raise VolumeFileError(path, expected, f"{channels} per pixel" if channels != 1 else f"depth {depth}")
-        bits = self.number(BITS, 1)
+        samples, depth = self.number(SAMPLES_PER_PIXEL, 1), self.number(DEPTH, 1)
+        planar = self.number(PLANAR, 1)
+        if not 1 <= samples <= MAX_SAMPLES or depth != 1 or planar not in (1, 2):
+            expected = f"pages of 1 to {MAX_SAMPLES} whole numbers or floats per pixel"
+            raise VolumeFileError(path, expected, f"{samples} per pixel" if depth == 1 else f"depth {depth}")
+        if self.number(SUBFILE, 0) & 5:
+            raise VolumeFileError(path, "pages in full resolution", "a smaller copy or a mask among them")
+        bits = self.alike(BITS, 1, samples)
         if bits not in (8, 16, 32, 64, 128) or self.number(FILL_ORDER, 1) != 1:
             raise VolumeFileError(path, "whole bytes per pixel, in order", f"{bits} bits")
-        dtype = _dtype(self.file.order, _KINDS.get(self.number(SAMPLE_FORMAT, 1), "V"), bits // 8)
+        kind = _KINDS.get(self.alike(SAMPLE_FORMAT, 1, samples), "V")
+        dtype = _dtype(self.file.order, kind, bits // 8)
         if not _known(dtype):
             sample_dtype(path, dtype)
         code = self.number(COMPRESSION, 1)
-        encoding = _COMPRESSIONS.get(code)
+        encoding = _COMPRESSIONS.get(code) or _CODED.get(code)
         if encoding is None:
             got = f"{_NAMES.get(code, f'compression {code}')} (save the file without compression)"
-            raise VolumeFileError(path, "uncompressed or deflate data", got)
+            raise VolumeFileError(path, f"data uncompressed, deflate, {', '.join(sorted(set(_CODED.values())))}", got)
         rows, columns = check_size(path, (self.number(LENGTH), self.number(WIDTH)))
-        return Plane(rows, columns, dtype, encoding)
+        return Plane(rows, columns, dtype, encoding, samples, planar == 2 and samples > 1)
 
     def _segments(self, plane: Plane) -> Segments:
         path, tiled = self.file.path, TILE_WIDTH in self.tags
         if tiled:
             high, wide = self.number(TILE_LENGTH), self.number(TILE_WIDTH)
-            if not 0 < high * wide * plane.dtype.itemsize <= MAX_SEGMENT or self.number(TILE_DEPTH, 1) != 1:
+            size = high * wide * plane.interleaved * plane.dtype.itemsize
+            if not 0 < size <= MAX_SEGMENT or self.number(TILE_DEPTH, 1) != 1:
                 raise VolumeFileError(path, f"tiles of at most {MAX_SEGMENT} bytes", f"{wide} × {high}")
         else:
             high, wide = min(self.number(ROWS_PER_STRIP, plane.rows), plane.rows), plane.columns
             if high < 1:
                 raise VolumeFileError(path, "one or more rows per strip", high)
-        count = -(-plane.rows // high) * -(-plane.columns // wide)
+        count = -(-plane.rows // high) * -(-plane.columns // wide) * (plane.samples if plane.planar else 1)
         offset_tag = TILE_OFFSETS if tiled and TILE_OFFSETS in self.tags else STRIP_OFFSETS
         count_tag = TILE_COUNTS if tiled and TILE_COUNTS in self.tags else STRIP_COUNTS
         offsets = self.numbers(offset_tag, count)
@@ -330,10 +438,10 @@ class TiffFile:
                 expected = f"a chain of pages that ends, within {self.length} bytes"
                 raise VolumeFileError(self.path, expected, f"a page at {offset}")
             seen.add(offset)
-            directory, offset = self._directory(offset)
+            directory, offset = self._directory(offset, len(seen) - 1)
             yield directory
 
-    def _directory(self, at: int) -> tuple[Directory, int]:
+    def _directory(self, at: int, index: int) -> tuple[Directory, int]:
         """The directory at a place, and where the next one is."""
         head, size = struct.calcsize(self.order + self._counter), struct.calcsize(self.order + self._entry)
         count = self._unpacked(self._counter, at)
@@ -350,7 +458,7 @@ class TiffFile:
                 there = n * _TYPE_BYTES.get(kind, 1) <= inline
                 tags.setdefault(tag, (kind, n, at + head + (i + 1) * size - inline if there else value))
         following = self._unpacked(self._offset, at + head + count * size)
-        return Directory(self, tags, at + head, content, last=following == 0), following
+        return Directory(self, tags, at + head, content, following == 0, index), following
 
     def _unpacked(self, layout: str, at: int) -> int:
         content = _exactly(self.stream, at, struct.calcsize(self.order + layout))
@@ -372,8 +480,10 @@ class TiffFile:
         if len(ends) and float(ends.max()) > self.length:
             expected = f"strips or tiles within its {self.length} bytes"
             raise VolumeFileError(self.path, expected, f"one that ends at {ends.max():.0f}")
-        rows = len(counts) * segments.high if segments.tiled else plane.rows
-        held = rows * segments.wide * itemsize
+        if not plane.own:  # of what codecs make of it no ratio is known
+            return
+        rows = len(counts) * segments.high if segments.tiled else plane.rows * plane.samples // plane.interleaved
+        held = rows * segments.wide * plane.interleaved * itemsize
         stored = int(counts.sum(dtype=np.int64))
         factor = EXPANSION["deflate"] if plane.encoding == "deflate" else 1
         if held > factor * stored or (plane.encoding == "raw" and held != stored):

@@ -1,13 +1,14 @@
 """Volume files: `load_volume`, `save_volume`, `describe`; which formats there are is `FORMATS`.
 
 Samples become torch tensors (D, H, W), x along W, in native byte order, contiguous and writable. Types: int8, int16,
-int32, int64, uint8, float16, float32, float64 as stored; bool -> uint8, uint16 -> int32, uint32 -> int64. uint64 and
-complex numbers are refused, and so are images and several channels (`.npy` and `.npz` may hold (N, C, D, H, W); axes
-of one entry are dropped from NRRD and NIfTI). Of a time series in NIfTI, `frame` chooses one volume.
+int32, int64, uint8, float16, float32, float64 as stored; bool -> uint8, uint16 -> int32, uint32 and uint64 -> int64.
+What int64 cannot hold is refused, and so are complex numbers and images. Of a time series, of vectors and of colours,
+`frame` and `channel` choose one volume (`.npy` and `.npz` may hold (N, C, D, H, W): without a choice all is read).
 
-Geometry is the 4×4 affine from voxel (x, y, z) to world. NIfTI is in RAS (x right, y anterior, z superior, mm); NRRD
-files that declare an anatomical space are converted to RAS; everything else is taken as it is. A round trip through any
-format that is written keeps the affine bit for bit, but NIfTI-1, which holds it in float32.
+Geometry is the 4×4 affine from voxel (x, y, z) to world. NIfTI is in RAS (x right, y anterior, z superior); NRRD files
+that declare an anatomical space are converted to RAS; everything else is taken as it is. What a file declares of its
+world (space, unit, codes of NIfTI) stays with the volume, and is written where the format has a place for it. A round
+trip through any format that is written keeps the affine bit for bit, but NIfTI-1, which holds it in float32.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from filterlab.io import nifti, nrrd, numpy_files, raw, tiff
+from filterlab.io import itk, nifti, nrrd, numpy_files, raw, tiff
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import VolumeFileError, VolumeHeader, beside, regular_file
 from filterlab.io.config import MAX_SIDECAR_BYTES, load_config, unknown_name
@@ -30,28 +31,25 @@ Writer = Callable[..., None]
 
 @dataclass(frozen=True)
 class VolumeFormat:
-    """A volume format: endings of its files, how its header is read, how a volume is written (None: read only).
-
-    With `frames`, it may hold a time series: then `read_header` takes a frame.
-    """
+    """A volume format: endings of its files, how its header is read, how a volume is written (None: read only)."""
 
     name: str
     endings: tuple[str, ...]
     read_header: Callable[..., VolumeHeader]
     write: Writer | None = None
     written: tuple[str, ...] = ()
-    frames: bool = False
 
 
 FORMATS: dict[str, VolumeFormat] = {
     known.name: known
     for known in (
         VolumeFormat("NRRD", (".nrrd", ".nhdr"), nrrd.read_header, nrrd.write, (".nrrd",)),
-        VolumeFormat("NIfTI", (".nii", ".nii.gz"), nifti.read_header, nifti.write, (".nii", ".nii.gz"), frames=True),
+        VolumeFormat("NIfTI", (".nii", ".nii.gz"), nifti.read_header, nifti.write, (".nii", ".nii.gz")),
         VolumeFormat("TIFF", tiff.SUFFIXES, tiff.read_header),
         VolumeFormat("npy", (".npy",), numpy_files.read_npy_header, numpy_files.write_npy, (".npy",)),
         VolumeFormat("npz", (".npz",), numpy_files.read_npz_header, numpy_files.write_npz, (".npz",)),
         VolumeFormat("raw", (".raw", ".raw.yaml"), raw.read_header),
+        VolumeFormat("ITK", itk.SUFFIXES, itk.read_header),
     )
 }
 
@@ -60,9 +58,12 @@ BATCHED = ("npy", "npz")  # formats that hold (N, C, D, H, W)
 
 
 def format_of(path: Path) -> VolumeFormat:
-    """The format of a file by its ending; a folder is a TIFF stack. Raises VolumeFileError that lists the endings."""
+    """The format of a file by its ending; a folder is a TIFF stack, or a DICOM series.
+
+    Raises VolumeFileError that lists the endings.
+    """
     if path.is_dir():
-        return FORMATS["TIFF"]
+        return FORMATS["ITK" if itk.is_series(path) else "TIFF"]
     name = path.name.lower()
     for known in FORMATS.values():
         if name.endswith(known.endings):
@@ -99,7 +100,9 @@ def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:
     """
     path = Path(path)
     name, found = format_of(path).name, [path]
-    if path.is_dir():
+    if name == "ITK":
+        found = itk.files_of(path)
+    elif path.is_dir():
         found = tiff.slices(path)
     elif name == "npy" and numpy_files.sidecar_of(path).exists():
         found.append(numpy_files.sidecar_of(path))
@@ -113,63 +116,71 @@ def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:
     return tuple(file.resolve() for file in found)
 
 
-def describe(path: str | os.PathLike[str], *, frame: int | None = None) -> VolumeHeader:
-    """The checked header of a volume file, without its voxels.
+def describe(path: str | os.PathLike[str], *, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
+    """The checked header of a volume file, without its voxels; `header.choice` says how many volumes it holds.
 
     Args:
-        path, frame: as for `load_volume`.
+        path, frame, channel: as for `load_volume`, but that a choice may be left open.
 
     Raises:
         FileNotFoundError: there is no such file.
-        VolumeFileError: no known format, a header that cannot be true of this file, or no such frame.
+        VolumeFileError: no known format, a header that cannot be true of this file, or no such frame or channel.
     """
     path = Path(path)
     known = format_of(path)
     if not path.is_dir():
         regular_file(path)
-    if frame is None:
-        return known.read_header(path)
-    if not known.frames:
-        raise VolumeFileError(path, f"no frame, because {known.name} files hold one volume", f"frame {frame!r}")
-    return known.read_header(path, frame)
+    return known.read_header(path, frame, channel)
 
 
-def load_volume(path: str | os.PathLike[str], *, frame: int | None = None, max_bytes: int = 2**33) -> Volume:
+def load_volume(
+    path: str | os.PathLike[str], *, frame: int | None = None, channel: int | None = None, max_bytes: int = 2**33
+) -> Volume:
     """The volume in a file (or in a folder of TIFF slices).
 
     Args:
-        path: NRRD, NIfTI, TIFF, .npy, .npz, or .raw with a sidecar (`FORMATS`).
-        frame: which volume of a NIfTI time series, from 0; needed there, and refused for every other file.
+        path: NRRD, NIfTI, TIFF, .npy, .npz, or .raw with a sidecar, or what SimpleITK reads (`FORMATS`); or the folder
+            of a DICOM series.
+        frame: which volume of a time series (or entry of a batch), from 0; needed where there are several.
+        channel: which of several values per voxel, from 0: components of vectors, colours, dyes; needed likewise.
         max_bytes: the most that the samples may take in memory; default 8 GiB. Reading takes at most 4 MiB + 2 × the
             file + 3 × `max_bytes` of memory and 1 s + 4 µs × the file + 50 ns × `max_bytes` of one core, whatever the
-            file says (`docs/extremes.md`).
+            file says (`docs/extremes.md`), but for what SimpleITK and the codecs of TIFF read.
 
     Raises:
         FileNotFoundError: there is no such file.
         VolumeFileError: an unknown format, a damaged file, or a header that promises what the file cannot hold; raised
-            before anything of the claimed size is allocated.
+            before anything of the claimed size is allocated. Also where one of several volumes has to be chosen.
+
+    Warns:
+        VolumeFileWarning: of what is odd and passed over, such as bytes behind the samples.
     """
-    header = describe(path, frame=frame)
+    header = describe(path, frame=frame, channel=channel)
     return Volume.with_geometry(header.read(max_bytes), header.geometry)
 
 
-def save_volume(volume: Volume | Tensor, path: str | os.PathLike[str], *, nifti2: bool = False) -> None:
+def save_volume(
+    volume: Volume | Tensor, path: str | os.PathLike[str], *, stored: str | None = None, nifti2: bool = False
+) -> None:
     """Writes a volume: `.nrrd` (gzip), `.nii`, `.nii.gz`, `.npy` (geometry in NAME.npy.yaml), `.npz`.
 
     A bare tensor (D, H, W) or (N, C, D, H, W) is a volume whose voxel centres are the integers.
 
     The file appears whole or not at all. A round trip keeps samples and affine bit for bit; but NIfTI-1 rounds every
     entry of the affine to float32, which changes it by at most 6e-8 of itself. float16 (in NRRD, NIfTI) and bfloat16
-    come back as float32. Gradients are not saved.
+    come back as float32. What is declared of the world is written where the format has a place for it: space and unit
+    in NRRD; unit, codes of both forms and version in NIfTI, whose space is always RAS. Gradients are not saved.
 
     Args:
         volume, path: what is written where; the ending tells the format.
+        stored: the type in the file, a NumPy name such as uint16; default the samples' own. It has to hold all of them.
         nifti2: write NIfTI-2, which keeps the affine bit for bit and which fewer tools open. Without it NIfTI-1 is
-            written wherever it can hold the volume: up to 32767 voxels along an axis, an affine within float32.
+            written wherever it can hold the volume (up to 32767 voxels along an axis, an affine within float32), unless
+            it comes from NIfTI-2.
 
     Raises:
-        VolumeFileError: an ending that is not written, a type or batch (N, C, …) that the format cannot hold, or
-            NIfTI-2 under another ending.
+        VolumeFileError: an ending that is not written, a type or batch (N, C, …) that the format cannot hold, samples
+            that `stored` cannot hold, or NIfTI-2 under another ending.
         ValueError, TypeError: a bare tensor that is no volume.
         OSError: the folder is missing or not writable.
     """
@@ -180,7 +191,7 @@ def save_volume(volume: Volume | Tensor, path: str | os.PathLike[str], *, nifti2
     options = {"nifti2": nifti2} if known.name == "NIfTI" else {}
     with atomic_write(path) as temporary:
         try:
-            known.write(volume, temporary, **options)
+            known.write(volume, temporary, stored, **options)
         except VolumeFileError as error:  # name the file that was asked for, not the temporary one
             raise VolumeFileError(path, error.expected, error.got) from None
         if path.name.lower().endswith(".npy"):

@@ -159,7 +159,7 @@ def data(found: Recommendation) -> dict[str, Any]:
     }
 
 
-def scene(found: Recommendation, file: str, voxel: float = 1.0) -> dict[str, Any]:
+def scene(found: Recommendation, file: str | dict[str, Any], voxel: float = 1.0) -> dict[str, Any]:
     """A scene that `filterlab render` takes: the volume, reconstructed as recommended, under a ramp of opacity."""
     chosen = found.chosen
     method: dict[str, Any] = {"name": chosen.method, "scheme": chosen.scheme, "boundary": found.boundary}
@@ -173,7 +173,7 @@ def scene(found: Recommendation, file: str, voxel: float = 1.0) -> dict[str, Any
     }
 
 
-def shown(file: str, value_range: tuple[float, float], voxel: float) -> dict[str, Any]:
+def shown(file: str | dict[str, Any], value_range: tuple[float, float], voxel: float) -> dict[str, Any]:
     """What of a scene is known before anything is recommended: the volume, and how it is shown."""
     low, span = value_range[0], range_of(value_range)
     points = [(0.15, (0.1, 0.15, 0.3), 0.0), (0.5, (0.75, 0.55, 0.4), 0.15), (1.0, (1.0, 0.97, 0.9), 0.6)]

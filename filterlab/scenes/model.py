@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
@@ -112,16 +112,19 @@ class VolumeFile(StrictModel):
         file: a path; `$NAME` in it stands for an environment variable. One that is not absolute is looked for in the
             folder of the scene, in the current folder, and in the folder named by $FILTERLAB_VOLUMES; `package:path` is
             a file that comes with an installed Python package (`nibabel:tests/data/example4d.nii.gz`).
-        frame: which volume of a NIfTI time series; see `filterlab.load_volume`.
+        frame, channel: which volume of a time series, which of several values per voxel; see `filterlab.load_volume`.
     """
+
+    bare: ClassVar[str] = "file"
 
     file: Annotated[str, Field(min_length=1)]
     frame: Annotated[int, Field(ge=0)] | None = None
+    channel: Annotated[int, Field(ge=0)] | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _from_path(cls, value: Any) -> Any:
-        return {"file": value} if isinstance(value, str) else value
+        return {cls.bare: value} if isinstance(value, str) else value
 
     def path(self, folder: Path = Path()) -> Path:
         """The file, absolute. Raises ValueError if there is none; the message lists where it was looked for."""
@@ -132,17 +135,17 @@ class VolumeFile(StrictModel):
 
         Raises VolumeFileError for a damaged file, or one that holds several volumes.
         """
-        header = describe(self.path(), frame=self.frame)
+        header = describe(self.path(), frame=self.frame, channel=self.channel)
+        header.check_choice()
         if len(header.shape) != 3:
-            raise VolumeFileError(
-                self.path(), "one volume of shape (D, H, W) to show", f"a batch (N, C, D, H, W) = {header.shape}"
-            )
+            expected = "one volume of shape (D, H, W) to show (a frame and a channel of several)"
+            raise VolumeFileError(self.path(), expected, f"a batch (N, C, D, H, W) = {header.shape}")
         return header
 
     def load(self) -> Volume:
         """The volume, with its geometry. Raises VolumeFileError as `header` does."""
         self.header()
-        return load_volume(self.path(), frame=self.frame)
+        return load_volume(self.path(), frame=self.frame, channel=self.channel)
 
 
 def find_volume(name: str, folder: Path = Path()) -> Path:

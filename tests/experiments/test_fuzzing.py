@@ -116,6 +116,7 @@ def test_a_process_that_tells_nothing_is_ended(monkeypatch):
 # --- forged files -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore::filterlab.io.warned.VolumeFileWarning")
 @pytest.mark.parametrize("kind", list(FORGERS))
 def test_forged_files_are_true_and_false(kind, tmp_path):
     """True ones are read with the samples that went in, and most false ones refused: else they would prove nothing."""
@@ -141,6 +142,7 @@ def test_forged_files_are_true_and_false(kind, tmp_path):
     assert len(seen) > 6  # different fields are false
 
 
+@pytest.mark.filterwarnings("ignore::filterlab.io.warned.VolumeFileWarning")
 @pytest.mark.parametrize("kind", ["NRRD raw", "NRRD bzip2", "NIfTI-1 gzip", "TIFF deflate", "npz raw", "raw"])
 def test_heavy_files_are_heavy_and_within_the_bounds(kind, tmp_path, monkeypatch):
     """As much of one thing as the format has room for."""

@@ -67,7 +67,6 @@ def nrrd_file(path: Path, data: bytes = bytes(24), drop: str = "", **fields: str
     ("fields", "words"),
     [
         ({"sizes": "4 3 3"}, ["36 bytes", "got 24 bytes"]),
-        ({"sizes": "4 3 1"}, ["12 bytes", "got 24 bytes"]),
         ({"sizes": "40000 40000 40000"}, ["64000000000000 bytes"]),
         ({"sizes": "2147483647 2147483647 2147483647"}, ["bytes of samples"]),
         ({"sizes": "4294967296 4294967296 1"}, ["sizes from 1"]),
@@ -78,16 +77,25 @@ def nrrd_file(path: Path, data: bytes = bytes(24), drop: str = "", **fields: str
         ({"sizes": "4 3 two"}, ["an integer", "'two'"]),
         ({"sizes": "4.0 3 2"}, ["an integer", "'4.0'"]),
         ({"sizes": "1_2 1 2"}, ["an integer"]),
-        ({"dimension": "2", "sizes": "6 4"}, ["three axes", "(6, 4)"]),
-        ({"dimension": "4", "sizes": "3 2 2 2"}, ["three axes"]),
+        ({"dimension": "2", "sizes": "6 4"}, ["three axes of space", "(6, 4)"]),
+        ({"dimension": "4", "sizes": "3 2 2 2"}, ["three axes of space, told from others by `kinds`"]),
+        ({"kinds": "RGB-color domain domain"}, ["three axes of space"]),
+        ({"kinds": "domain domain"}, ["3 values in `kinds`"]),
+        (
+            {"dimension": "5", "sizes": "2 1 3 2 2", "kinds": "list domain domain domain vector"},
+            ["at most one axis of time and one of components"],
+        ),
         ({"dimension": "99"}, ["from 1 to 16"]),
         ({"dimension": "-3"}, ["from 1 to 16"]),
         ({"dimension": "three"}, ["an integer", "dimension"]),
         ({"type": "block"}, ["a type among", "'block'"]),
-        ({"type": "uint64"}, ["a type among", "'uint64'"]),
+        ({"type": "uint64", "sizes": "3 1 1"}, ["`endian`"]),
+        ({"type": "uint128"}, ["a type among", "'uint128'"]),
         ({"type": "int16", "sizes": "2 3 2"}, ["`endian`"]),
         ({"type": "int16", "sizes": "2 3 2", "endian": "middle"}, ["little or big"]),
-        ({"encoding": "ascii"}, ["encoding raw, gzip"]),
+        ({"encoding": "ascii", "sizes": "40 3 2"}, ["240 numbers as text"]),
+        ({"encoding": "ascii", "data_file": "/etc/passwd"}, ["same folder or below"]),
+        ({"encoding": "base64"}, ["encoding raw, gzip"]),
         ({"encoding": "gzip", "sizes": "1000000 1000000 1000"}, ["cannot hold that many"]),
         ({"encoding": "bzip2", "sizes": "1000000 1000000 1000"}, ["at most 8589934592 bytes", "max_bytes"]),
         ({"encoding": "bzip2", "byte_skip": "67108865"}, ["at most 67108864 bytes before the samples"]),
@@ -111,7 +119,7 @@ def nrrd_file(path: Path, data: bytes = bytes(24), drop: str = "", **fields: str
         ({"byte_skip": "-1", "sizes": "4 3 9"}, ["108 bytes"]),
         ({"byte_skip": "-2"}, ["byte skip"]),
         ({"byte_skip": "999999999999999999"}, ["got 24 bytes"]),
-        ({"line_skip": "1"}, ["line skip: 0"]),
+        ({"line_skip": "x"}, ["samples that ITK reads"]),
         ({"data_file": "/etc/passwd"}, ["same folder or below", "'/etc/passwd'"]),
         ({"data_file": "../secret.raw"}, ["same folder or below"]),
         ({"data_file": "sub/../../secret.raw"}, ["same folder or below"]),
@@ -170,12 +178,8 @@ def test_a_link_inside_the_folder_is_followed(tmp_path: Path) -> None:
     ("data", "word"),
     [
         (zipped(bytes(23)), "after 23"),
-        (zipped(bytes(25)), "more than that"),
-        (zipped(bytes(24)) * 2, "more than that"),
-        (zipped(bytes(2**26), 9), "more than that"),  # 64 MiB from 64 kB
         (zipped(bytes(24))[:-9], "damaged or truncated"),
         (zipped(bytes(24))[:-4] + bytes(4), "damaged or truncated"),
-        (zipped(bytes(24)) + b"junk", "damaged or truncated"),
         (b"no gzip at all, but long enough", "damaged or truncated"),
         (zipped(bytes(24))[:12] + b"\xff" * 20, "damaged or truncated"),
     ],
@@ -236,7 +240,6 @@ def test_gzip_claims_what_it_could_but_does_not_hold(tmp_path: Path) -> None:
     ("data", "word"),
     [
         (bz2.compress(bytes(23)), "after 23"),
-        (bz2.compress(bytes(2**26)), "more than that"),
         (bz2.compress(bytes(24))[:-5], "damaged or truncated"),
         (b"x" * 40, "damaged or truncated"),
     ],
@@ -270,16 +273,17 @@ def nifti_file(path: Path, *patches: tuple[int, str, tuple]) -> Path:
         ((DIM, "4h", (3, -4, 3, 2)), "sizes from 1"),
         ((DIM, "4h", (3, -1, 3, 2)), "sizes from 1"),
         ((DIM, "4h", (3, 0, 3, 2)), "sizes from 1"),
-        ((DIM, "4h", (2, 8, 3, 1)), "three axes"),
+        ((DIM, "4h", (2, 8, 3, 1)), "three axes of space"),
         ((DIM, "5h", (4, 2, 2, 2, 3)), "a choice among its 3 frames"),
-        ((DIM, "6h", (5, 2, 2, 2, 1, 3)), "three axes"),
+        ((DIM, "6h", (5, 2, 2, 2, 1, 3)), "a choice among its 3 channels, channel=0 to channel=2"),
+        ((DIM, "7h", (6, 2, 2, 2, 1, 1, 3)), "three axes of space"),
         ((DIM, "h", (0,)), "dim[0]"),
         ((DIM, "h", (-3,)), "dim[0]"),
         ((DIM, "h", (200,)), "dim[0]"),
         ((DATATYPE, "h", (9999,)), "a known data type"),
         ((DATATYPE, "hh", (32, 64)), "a type among"),  # complex
-        ((DATATYPE, "hh", (128, 24)), "a type among"),  # RGB
-        ((DATATYPE, "hh", (1280, 64)), "a type among"),  # uint64
+        ((DATATYPE, "hh", (128, 24)), ""),  # RGB, of three times as many bytes
+        ((DATATYPE, "hh", (1280, 64)), "192"),  # uint64
         ((BITPIX, "h", (16,)), "bitpix 8"),
         ((VOX_OFFSET, "f", (0.0,)), "vox_offset"),
         ((VOX_OFFSET, "f", (-400.0,)), "vox_offset"),
@@ -291,7 +295,7 @@ def nifti_file(path: Path, *patches: tuple[int, str, tuple]) -> Path:
         ((SLOPE, "ff", (float("inf"), 0.0)), "finite scl_slope"),
         ((SLOPE, "ff", (2.0, float("nan"))), "finite scl_slope"),
         ((SROW, "f", (float("nan"),)), "affine"),
-        ((SROW, "12f", (0.0,) * 12), "invertible"),
+        ((SROW, "11f", (1.0,) * 11), "invertible"),
         ((MAGIC, "4s", (b"ni1\0",)), "a single NIfTI file"),
         ((0, "i", (349,)), "a NIfTI header"),
     ],
@@ -309,7 +313,6 @@ def test_nifti_truncated_and_endless(tmp_path: Path) -> None:
     whole = nifti_file(tmp_path / "a.nii").read_bytes()
     for content, word in (
         (whole[:-1], "24 bytes"),
-        (whole + b"1", "got 25 bytes"),
         (whole[:300], "header"),
         (b"", "header"),
     ):
@@ -318,7 +321,6 @@ def test_nifti_truncated_and_endless(tmp_path: Path) -> None:
     packed = gzip.compress(whole)
     for content, word in (
         (packed[:-1], "damaged or truncated"),
-        (gzip.compress(whole + bytes(2**26)), "more than that"),
         (gzip.compress(whole[:-1]), "after 23"),
         (b"", "header"),
         (packed[:50], "damaged or truncated"),
@@ -343,7 +345,6 @@ def test_a_time_series_that_lies(tmp_path: Path) -> None:
     for content, word in (
         (gzip.compress(whole[:-1]), "more bytes"),  # the frame itself is there
         (gzip.compress(whole[:-9]), "after 7"),
-        (gzip.compress(whole + bytes(2**26)), "more than that"),
         (packed[:-4] + bytes(4), "damaged or truncated"),
     ):
         (tmp_path / "d.nii.gz").write_bytes(content)
@@ -367,7 +368,6 @@ def npy_bytes(header: str, data: bytes = bytes(24), version: bytes = b"\x01\x00"
     ("header", "words"),
     [
         ("{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 5)}", ["30 bytes", "24"]),
-        ("{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 3)}", ["18 bytes", "24"]),
         ("{'descr': '<f8', 'fortran_order': True, 'shape': (100000, 100000, 100000)}", ["8000000000000000 bytes"]),
         ("{'descr': '|u1', 'fortran_order': False, 'shape': (-2, -3, 4)}", ["sizes from 1"]),
         ("{'descr': '|u1', 'fortran_order': False, 'shape': (0, 3, 4)}", ["sizes from 1"]),
@@ -378,7 +378,7 @@ def npy_bytes(header: str, data: bytes = bytes(24), version: bytes = b"\x01\x00"
         ("{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 2, 2)}", ["(D, H, W)"]),
         ("{'descr': '|O', 'fortran_order': False, 'shape': (1, 1, 3)}", ["a type among"]),
         ("{'descr': '<c8', 'fortran_order': False, 'shape': (1, 1, 3)}", ["a type among"]),
-        ("{'descr': '<u8', 'fortran_order': False, 'shape': (1, 1, 3)}", ["a type among"]),
+        ("{'descr': '<u8', 'fortran_order': False, 'shape': (1, 1, 4)}", ["32 bytes", "24"]),
         ("{'descr': '|S3', 'fortran_order': False, 'shape': (2, 2, 2)}", ["a type among"]),
         ("{'descr': [('a', '|u1')], 'fortran_order': False, 'shape': (2, 3, 4)}", ["a type among"]),
         ("{'descr': '<M8[s]', 'fortran_order': False, 'shape': (1, 1, 3)}", ["a type among"]),
@@ -772,11 +772,11 @@ def test_tiff_pages_that_differ_and_images(tmp_path: Path) -> None:
     tifffile.imwrite(path, np.zeros((4, 4), np.uint8))
     refused(path, "two or more pages")
     tifffile.imwrite(path, np.zeros((3, 8, 8, 3), np.uint8), photometric="rgb")
-    refused(path, "one whole number or float per pixel")
+    refused(path, "a choice among its 3 channels")
     tifffile.imwrite(path, np.zeros((3, 8, 8), np.complex64), photometric="minisblack")
     refused(path, "a type among")
     tifffile.imwrite(path, np.zeros((2, 3, 8, 8), np.uint8), imagej=True, metadata={"axes": "TZYX"})
-    refused(path, "one channel and one frame")
+    refused(path, "a choice among its 2 frames")
 
 
 def test_tiff_folders(tmp_path: Path) -> None:
@@ -795,6 +795,7 @@ patches = st.binary(max_size=30) | st.sampled_from(NUMBERS + WORDS)
 edits = st.lists(st.builds(Edit, st.sampled_from(KINDS), st.floats(0, 1), patches), min_size=1, max_size=3)
 
 
+@pytest.mark.filterwarnings("ignore::filterlab.io.warned.VolumeFileWarning")
 @pytest.mark.parametrize("original", originals().values(), ids=lambda original: original.name)
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(edits=edits)

@@ -17,7 +17,7 @@ from filterlab.ops.cpu import machine
 from filterlab.ops.cpu import raycast as vector_code
 from filterlab.ops.differentiable import raycast
 from filterlab.ops.raycast import Raycast, marks_of
-from tests.test_methods import TENSOR_PRODUCTS
+from tests.test_methods import CONTINUOUS, TENSOR_PRODUCTS
 
 AFFINE = [[1.5, 0.2, 0.1, 3.0], [0.0, -0.8, 0.3, -2.0], [0.1, 0.0, 2.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
 LEVEL = 0.5
@@ -114,7 +114,7 @@ def test_float32_is_rounded_only(method):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_neighbouring_pieces_share_their_ends_to_the_bit(method, dtype):
     field = fl.reconstruct(fl.Volume(samples(), affine=AFFINE), method)
     found = raycast.candidates(described(field, dtype), *rays(field, 2000, dtype), "cpu")
