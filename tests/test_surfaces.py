@@ -249,7 +249,7 @@ def test_a_crossing_at_a_knot_is_one_hit(name):
         assert float((t[:, 0] - (level - origins[:, 0])).abs().max()) < 1e-14 * 8
 
 
-@pytest.mark.parametrize("method", [m for m in TENSOR_PRODUCTS if m != "trilinear"])
+@pytest.mark.parametrize("method", [m for m in CONTINUOUS if m != "trilinear"])
 def test_a_crossing_where_cells_meet_is_one_hit(method):
     """Rays through a corner of cells, not exactly, at its level: pieces no longer than rounding held several roots."""
     rng = np.random.default_rng(0)
