@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from itertools import product
+from itertools import permutations, product
 from typing import Any, Protocol
 
 from torch import Tensor
@@ -98,6 +98,17 @@ class Tetrahedra:
     def norm(self) -> float:
         """No value is larger than this times the largest sample."""
         return max(math.fsum(map(abs, mask)) for mask in self.masks)
+
+    @cached_property
+    def masks_of_cube(self) -> tuple[tuple[float, ...], ...]:
+        """The masks of all coefficients of a cube, each once: weights of its block's samples, z running fastest."""
+        places, middle, found = list(product(range(self.size), repeat=3)), (self.size - 1) / 2, {}
+        for mask, axes, signs in product(self.masks, permutations(range(3)), product((1, -1), repeat=3)):
+            weights = {}
+            for weight, (_, at) in zip(mask, self.samples, strict=True):
+                weights[tuple(int(middle + s * (at[a] - middle)) for a, s in zip(axes, signs, strict=True))] = weight
+            found[tuple(weights.get(place, 0.0) for place in places)] = None
+        return tuple(found)
 
     @property
     def around(self) -> int:

@@ -16,11 +16,12 @@ from filterlab.ops.cpu.hulls import HullsJob, HullsVariant
 from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.gather import STORAGE, in_whole_rows
 from filterlab.ops.pieces import Lattice
+from filterlab.ops.tetrahedra import AnyLattice
 
 _LAYERS = 32  # of cells at a time, where they are joined to parts
 
 
-def bounds(lattice: Lattice, edge: int, codes: Codes) -> Bounds:
+def bounds(lattice: AnyLattice, edge: int, codes: Codes) -> Bounds:
     """`ops.reference.bounds.bounds`, fused."""
     coefficients, depth = in_whole_rows(lattice.coefficients), lattice.cells[2]
     step = depth if edge == 1 else _LAYERS
@@ -34,7 +35,7 @@ def bounds(lattice: Lattice, edge: int, codes: Codes) -> Bounds:
 
 
 def _of_layers(
-    lattice: Lattice, coefficients: Tensor, codes: Codes, depth: int
+    lattice: AnyLattice, coefficients: Tensor, codes: Codes, depth: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
     """Of single cells, whose first taps are the first of the coefficients."""
     plane, row, _ = coefficients.stride()
@@ -59,8 +60,9 @@ def _of_layers(
     return low, high, (least, most)
 
 
-def _variant(lattice: Lattice, coefficients: Tensor, lanes: int) -> HullsVariant:
-    return HullsVariant(lattice.stencil.lowered, lattice.degrees, STORAGE[coefficients.dtype], lanes)
+def _variant(lattice: AnyLattice, coefficients: Tensor, lanes: int) -> HullsVariant:
+    degrees = lattice.degrees if isinstance(lattice, Lattice) else (lattice.degree, lattice.degree, lattice.degree)
+    return HullsVariant(lattice.stencil.lowered, degrees, STORAGE[coefficients.dtype], lanes)
 
 
 def _joined(cells: np.ndarray, edge: int, least: np.ufunc) -> np.ndarray:

@@ -1,7 +1,8 @@
 """The program that bounds the polynomials on cells: coefficients in, codes of the least and the greatest out.
 
 For P cells of a row at a time: in every plane of taps sums along x and y, to Bernstein coefficients in x and y of the
-plane, which are kept in memory; then, for each of these, sums along z over the planes, of which none is kept.
+plane, which are kept in memory; then, for each of these, sums along z over the planes, of which none is kept. Of a
+spline on tetrahedra every mask that a cube has, of its samples in registers.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import ctypes
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from types import SimpleNamespace
 
 import torch
@@ -20,6 +22,7 @@ from filterlab.ops.bounds import CODES
 from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.lanes import DOUBLE, I16, I32, I64, STORAGE, Lanes, Value
 from filterlab.ops.stencil import Lowered
+from filterlab.ops.tetrahedra import LoweredStencil, TetrahedralStencil
 
 # Arrays are contiguous; d is a double.
 FIELDS: dict[str, type] = {
@@ -48,13 +51,13 @@ class HullsVariant:
     """Everything the program depends on, apart from the machine.
 
     Attributes:
-        stencil: the sum over taps, one row.
-        degrees: of a cell's polynomial in x, y, z.
+        stencil: what is summed, one row.
+        degrees: of a cell's polynomial in x, y, z, of sums over taps.
         storage: dtype of the coefficients.
         lanes: P.
     """
 
-    stencil: Lowered
+    stencil: LoweredStencil
     degrees: tuple[int, int, int]
     storage: str
     lanes: int
@@ -62,27 +65,30 @@ class HullsVariant:
     def generate(self) -> str:
         """The program as LLVM IR text."""
         module, function = frame.new_module()
-        _Program(self, function).write()
+        on_tetrahedra = isinstance(self.stencil, TetrahedralStencil)
+        (_OfCubes if on_tetrahedra else _OfCells)(self, function).write()
         return str(module)
 
 
 class _Program:
+    """What both have in common: packs of cells, bounds, codes."""
+
     def __init__(self, variant: HullsVariant, function: ir.Function) -> None:
         self.variant, self.storage = variant, STORAGE[variant.storage]
         self.builder = ir.IRBuilder(function.append_basic_block("entry"))
         self.lanes = Lanes(self.builder, "float64", variant.lanes)
         self.job: SimpleNamespace = frame.load_job(self.lanes, function.args[0], FIELDS)
-        self.weights = [
-            [[_bernstein(row, degree) for row in table] for table in tables]
-            for tables, degree in zip(variant.stencil.functions, variant.degrees, strict=True)
-        ]
-        self.planes = list(dict.fromkeys((a, b) for _, a, b, _ in variant.stencil.rows[0]))
-        self.columns = (variant.degrees[0] + 1) * (variant.degrees[1] + 1)
+
+    def prepare(self) -> None:
+        """Reserve what has to be reserved before any loop."""
+
+    def bound(self, z: Value, y: Value, x: Value) -> None:
+        """All coefficients of a pack of cells from x on."""
+        raise NotImplementedError
 
     def write(self) -> None:
         e, b, j = self.lanes, self.builder, self.job
-        depth = self.variant.stencil.supports[2]
-        self.kept = e.reserve(e.pack, len(self.planes) * self.columns * depth)
+        self.prepare()
         never = e.constant(math.inf)
         self.low, self.high, self.total, self.least, self.most = (e.variable(never) for _ in range(5))
         packs = b.udiv(b.add(j.cells_x, I64(e.count - 1)), I64(e.count))
@@ -101,64 +107,17 @@ class _Program:
         x = e.smaller(x, b.sub(j.cells_x, I64(e.count)))
         self.low.value, self.high.value = e.constant(math.inf), e.constant(-math.inf)
         self.total.value = e.constant(0)
-        with e.repeat(I64(0), I64(self.variant.stencil.supports[2])) as dz:
-            row = b.add(b.mul(b.add(z, dz), j.height), y)
-            for place, pack in enumerate(self._of_plane(row, x)):
-                e.store(pack, self._place(I64(place), dz))
-        with e.repeat(I64(0), I64(self.columns)) as column:
-            self._bound(self._along_z(column))
+        self.bound(z, y, x)
         self._write(b.add(b.mul(b.add(b.mul(z, j.cells_y), y), j.cells_x), x))
-
-    def _of_plane(self, row: Value, x: Value) -> Iterator[Value]:
-        """Coefficients in x and y of a plane of taps, for all that is summed of it: x runs fastest, then y."""
-        b, v = self.builder, self.variant
-        planes: dict[tuple[int, int, int, int], Value] = {}
-        for dy in range(v.stencil.supports[1]):
-            first = b.add(b.mul(b.add(row, I64(dy)), self.job.width), x)
-            line = [self._load(b.add(first, I64(t))) for t in range(v.stencil.supports[0])]
-            along = {a: self._sums(line, self.weights[0][a]) for a in dict.fromkeys(a for a, _ in self.planes)}
-            for a, f in self.planes:
-                for k, weight in enumerate(self.weights[1][f][dy]):
-                    for i, pack in enumerate(along[a]):
-                        planes[a, f, k, i] = self._added(planes.get((a, f, k, i)), weight, pack)
-        for a, f in self.planes:
-            for k in range(v.degrees[1] + 1):
-                for i in range(v.degrees[0] + 1):
-                    yield planes[a, f, k, i]
 
     def _load(self, index: Value) -> Value:
         e, storage = self.lanes, self.storage
         return e.convert(e.load(e.advance(self.job.coefficients, index, storage.raw), storage.raw, e.count), storage)
 
-    def _sums(self, taps: Sequence[Value], weights: Sequence[Sequence[float]]) -> list[Value]:
-        """Σ_t weights[t][i] · tap t, for every i."""
-        found: list[Value] = []
-        for row in zip(*weights, strict=True):
-            total = self.lanes.constant(0)
-            for weight, tap in zip(row, taps, strict=True):
-                total = self._added(total, weight, tap)
-            found.append(total)
-        return found
-
     def _added(self, total: Value | None, weight: float, pack: Value) -> Value:
         e = self.lanes
         total = e.constant(0) if total is None else total
         return e.multiply_add(pack, e.constant(weight), total) if weight else total
-
-    def _place(self, place: Value, dz: Value) -> Value:
-        b, depth = self.builder, self.variant.stencil.supports[2]
-        return self.lanes.advance(self.kept, b.add(b.mul(place, I64(depth)), dz), self.lanes.pack)
-
-    def _along_z(self, column: Value) -> list[Value]:
-        """Coefficients along z, of one in x and y."""
-        e, b, v = self.lanes, self.builder, self.variant
-        found = [e.constant(0)] * (v.degrees[2] + 1)
-        for factor, a, f, c in v.stencil.rows[0]:
-            place = b.add(column, I64(self.planes.index((a, f)) * self.columns))
-            for dz, weights in enumerate(self.weights[2][c]):
-                pack = e.load(self._place(place, I64(dz)), DOUBLE, e.count)
-                found = [self._added(t, factor * w, pack) for t, w in zip(found, weights, strict=True)]
-        return found
 
     def _bound(self, coefficients: Sequence[Value]) -> None:
         e = self.lanes
@@ -181,6 +140,96 @@ class _Program:
             code = e.clamp(e.where(whole, e.floor(value), e.constant(if_none)), e.constant(0), e.constant(CODES - 1))
             code = b.sub(e.to_integer(code), ir.Constant(ir.VectorType(I32, e.count), [CODES // 2] * e.count))
             e.store(b.trunc(code, ir.VectorType(I16, e.count)), e.advance(array, place, I16))
+
+
+class _OfCells(_Program):
+    """Of sums over taps."""
+
+    def __init__(self, variant: HullsVariant, function: ir.Function) -> None:
+        super().__init__(variant, function)
+        assert isinstance(variant.stencil, Lowered)
+        self.stencil = variant.stencil
+        self.weights = [
+            [[_bernstein(row, degree) for row in table] for table in tables]
+            for tables, degree in zip(self.stencil.functions, variant.degrees, strict=True)
+        ]
+        self.planes = list(dict.fromkeys((a, b) for _, a, b, _ in self.stencil.rows[0]))
+        self.columns = (variant.degrees[0] + 1) * (variant.degrees[1] + 1)
+
+    def prepare(self) -> None:
+        e = self.lanes
+        self.kept = e.reserve(e.pack, len(self.planes) * self.columns * self.stencil.supports[2])
+
+    def bound(self, z: Value, y: Value, x: Value) -> None:
+        e, b = self.lanes, self.builder
+        with e.repeat(I64(0), I64(self.stencil.supports[2])) as dz:
+            row = b.add(b.mul(b.add(z, dz), self.job.height), y)
+            for place, pack in enumerate(self._of_plane(row, x)):
+                e.store(pack, self._place(I64(place), dz))
+        with e.repeat(I64(0), I64(self.columns)) as column:
+            self._bound(self._along_z(column))
+
+    def _of_plane(self, row: Value, x: Value) -> Iterator[Value]:
+        """Coefficients in x and y of a plane of taps, for all that is summed of it: x runs fastest, then y."""
+        b, v = self.builder, self.variant
+        planes: dict[tuple[int, int, int, int], Value] = {}
+        for dy in range(self.stencil.supports[1]):
+            first = b.add(b.mul(b.add(row, I64(dy)), self.job.width), x)
+            line = [self._load(b.add(first, I64(t))) for t in range(self.stencil.supports[0])]
+            along = {a: self._sums(line, self.weights[0][a]) for a in dict.fromkeys(a for a, _ in self.planes)}
+            for a, f in self.planes:
+                for k, weight in enumerate(self.weights[1][f][dy]):
+                    for i, pack in enumerate(along[a]):
+                        planes[a, f, k, i] = self._added(planes.get((a, f, k, i)), weight, pack)
+        for a, f in self.planes:
+            for k in range(v.degrees[1] + 1):
+                for i in range(v.degrees[0] + 1):
+                    yield planes[a, f, k, i]
+
+    def _sums(self, taps: Sequence[Value], weights: Sequence[Sequence[float]]) -> list[Value]:
+        """Σ_t weights[t][i] · tap t, for every i."""
+        found: list[Value] = []
+        for row in zip(*weights, strict=True):
+            total = self.lanes.constant(0)
+            for weight, tap in zip(row, taps, strict=True):
+                total = self._added(total, weight, tap)
+            found.append(total)
+        return found
+
+    def _place(self, place: Value, dz: Value) -> Value:
+        b, depth = self.builder, self.stencil.supports[2]
+        return self.lanes.advance(self.kept, b.add(b.mul(place, I64(depth)), dz), self.lanes.pack)
+
+    def _along_z(self, column: Value) -> list[Value]:
+        """Coefficients along z, of one in x and y."""
+        e, b, v = self.lanes, self.builder, self.variant
+        found = [e.constant(0)] * (v.degrees[2] + 1)
+        for factor, a, f, c in self.stencil.rows[0]:
+            place = b.add(column, I64(self.planes.index((a, f)) * self.columns))
+            for dz, weights in enumerate(self.weights[2][c]):
+                pack = e.load(self._place(place, I64(dz)), DOUBLE, e.count)
+                found = [self._added(t, factor * w, pack) for t, w in zip(found, weights, strict=True)]
+        return found
+
+
+class _OfCubes(_Program):
+    """Of a spline on tetrahedra, with the same samples for all of a cube: every different mask, once."""
+
+    def bound(self, z: Value, y: Value, x: Value) -> None:
+        stencil = self.variant.stencil
+        assert isinstance(stencil, TetrahedralStencil)
+        samples = [self._sample(z, y, x, at) for at in product(range(stencil.spline.size), repeat=3)]
+        for mask in stencil.spline.masks_of_cube:
+            total = None
+            for weight, sample in zip(mask, samples, strict=True):
+                if weight:
+                    total = self.lanes.multiply_add(sample, self.lanes.constant(weight), total)
+            self._bound([total])
+
+    def _sample(self, z: Value, y: Value, x: Value, at: Sequence[int]) -> Value:
+        b, j = self.builder, self.job
+        row = b.add(b.mul(b.add(z, I64(at[2])), j.height), b.add(y, I64(at[1])))
+        return self._load(b.add(b.mul(row, j.width), b.add(x, I64(at[0]))))
 
 
 def _bernstein(monomial: Sequence[float], degree: int) -> list[float]:

@@ -18,8 +18,8 @@ _FEWEST = 1 << 16
 
 def missing(lattice: AnyLattice) -> str | None:
     """What keeps the program from running here; None: nothing does."""
-    if isinstance(lattice, TetrahedralLattice):
-        return "it bounds sums over taps"
+    if isinstance(lattice, TetrahedralLattice) and lattice.spline.octahedral:
+        return "its cells are cubes; got octahedra"
     if problem := cpu.llvmlite_problem():
         return problem
     c = lattice.coefficients
