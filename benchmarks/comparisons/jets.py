@@ -11,7 +11,7 @@ from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_i
 from benchmarks.records import at_most
 from benchmarks.settings import Settings
 from filterlab import ops
-from filterlab.methods import METHODS, reconstruct
+from filterlab.methods import METHODS, Tetrahedral, reconstruct
 
 # key: method, kind of gradient (None: the method's own)
 _CASES: dict[str, tuple[str, str | None]] = {
@@ -76,6 +76,20 @@ def _race(settings: Settings, case: str, arrangement: str) -> Race:
     return Race(f"{method} value + {kind}, {_at(settings, arrangement)}", contestants, ratios, tolerance=2e-5)
 
 
+def _on_tetrahedra(settings: Settings, arrangement: str) -> Race:
+    """Splines on tetrahedra against the tensor product of the same accuracy, fused both."""
+    volume = workloads.noise(settings.voxels)
+    where = workloads.points(arrangement, settings.voxels, settings.points)
+    splines = [name for name, method in METHODS.items() if isinstance(method, Tetrahedral)]
+    contestants = [
+        field_contestant(name, "fused", volume, where, name=name, computes=f"{name} value and gradient")
+        for name in ("triquadratic", *splines)
+    ]
+    bar = at_most("2") if arrangement == "coherent" else None
+    ratios = [Ratio(name, "triquadratic", bar) for name in splines]
+    return Race(f"splines on tetrahedra, value + gradient, {_at(settings, arrangement)}", contestants, ratios)
+
+
 def _at(settings: Settings, arrangement: str) -> str:
     """The workload in words."""
     order = "along rays" if arrangement == "coherent" else "at random"
@@ -86,6 +100,9 @@ def _items(settings: Settings) -> list[Item]:
     return [
         race_item(f"{case}-{arrangement}", 15, lambda s, case=case, order=arrangement: _race(s, case, order))
         for case in _CASES
+        for arrangement in workloads.ARRANGEMENTS
+    ] + [
+        race_item(f"tetrahedra-{arrangement}", 15, lambda s, order=arrangement: _on_tetrahedra(s, order))
         for arrangement in workloads.ARRANGEMENTS
     ]
 
