@@ -194,7 +194,7 @@ class Resample:
     examples:
       filterlab resample engine.nrrd -o fine.nrrd --method notch --spacing 0.5 0.5 0.5
       filterlab resample engine.nrrd -o small.nii.gz --shape 128 128 64 --dtype input
-      filterlab resample pet.nii.gz -o pet_on_ct.nii.gz --like ct.nii.gz --boundary border
+      filterlab resample pet.nii.gz -o pet_on_ct.nii.gz --like ct.nii.gz --fill 0
       filterlab resample cells.ome.tif -o nuclei.nrrd --channel 1 --frame 0 --spacing 0.2 0.2 0.2
       filterlab resample organs.nii.gz -o organs_on_ct.nii.gz --like ct.nii.gz --labels
     """
@@ -219,6 +219,8 @@ class Resample:
     """Which volume of a time series (or entry of a batch), from 0."""
     channel: Channel = None
     """Which of several values per voxel, from 0: components of vectors, colours, dyes."""
+    fill: float | None = None
+    """The value of voxels outside of IN, for --like; `nan` too. Default: none, the boundary rules there."""
     labels: bool = False
     """The values of IN are names, not amounts: of each the method reconstructs where it is, and the strongest wins."""
     dtype: str | None = None
@@ -261,6 +263,7 @@ class Resample:
         stored = _result_type(self.dtype or ("input" if keeps else None), source)
         working = _working_type(stored, source)
         check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)
+        self._check_fill(stored)
         limit = _limit(self.max_gigabytes)
         shape = [*source.shape[:-3], *self._new_size(source, target)]
         itemsize = max(working.itemsize, source.dtype.itemsize if keeps else 0, np.dtype(stored or "float32").itemsize)
@@ -271,10 +274,20 @@ class Resample:
             grid = {"like": Volume.with_geometry(torch.zeros(()).expand(target.shape[-3:]), target.geometry)}
         if not keeps:
             _tell_labels(volume, source, self.input)
-        asked = {"dtype": None if keeps or stored is None else working, "labels": self.labels}
+        asked = {"dtype": None if keeps or stored is None else working, "labels": self.labels, "fill": self.fill}
         result = resample(volume, self.method, boundary=self.boundary, nan=self.nan, **asked, **grid)
         save_volume(_converted(result, stored), self.output, stored=stored, nifti2=self.nifti2)
         _tell_rounding(result, self.output, self.nifti2)
+
+    def _check_fill(self, stored: str | None) -> None:
+        """Raises ValueError for a fill that no integer of the result is."""
+        import numpy as np
+
+        if self.fill is None or stored is None or stored.startswith("float"):
+            return
+        info = np.iinfo(stored)
+        if not (math.isfinite(self.fill) and self.fill == int(self.fill) and info.min <= self.fill <= info.max):
+            raise ValueError(f"expected a --fill that {stored} holds; got {self.fill:g}")
 
     def _new_size(self, source: VolumeHeader, target: VolumeHeader | None) -> list[float]:
         """Voxels along x, y, z of the result; checks what was asked."""

@@ -5,7 +5,8 @@ The nearest sample is taken as it stands, in its own type.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from filterlab.ops.reference.gather import locate, tap_weights
 from filterlab.volume import Boundary, Geometry, Volume, as_volume, exact_float
 
 POINTS_AT_ONCE = 1 << 20
+NEARER = 1e-9  # voxels within which two coordinates are the same: what is halfway between samples, or on the box
 
 
 def resample(
@@ -35,6 +37,7 @@ def resample(
     dtype: torch.dtype | None = None,
     nan: str = "refuse",
     labels: bool = False,
+    fill: float | None = None,
 ) -> Volume:
     """The volume reconstructed by a method and sampled on another grid.
 
@@ -50,6 +53,8 @@ def resample(
         labels: every value is a name. Of each the indicator is resampled, and the one that is greatest wins, of equal
             ones the least: no value arises that the volume has not. Takes as long as resampling once for every label,
             in the memory of one. Not differentiable.
+        fill: the value of new voxels whose centres lie outside of the old box of voxels, which ends half a voxel beyond
+            the outermost centres; NaN too. Default: none, the boundary rules there.
 
     Exactly one of spacing, shape and like must be given. This reconstructs, it does not anti-alias: when the new grid
     is coarser than the old one, blur first. Cost: one pass of S taps per axis; memory: about two volumes of the larger
@@ -59,17 +64,24 @@ def resample(
         a Volume, differentiable in the samples.
 
     Raises:
-        ValueError: also for integers that the type of the computation does not hold.
+        ValueError: also for integers that the type of the computation does not hold; and where no new voxel lies in the
+            old box, unless the boundary is `wrap` or there is a `fill`.
     """
     volume, boundary = as_volume(volume), Boundary.named(boundary)
     target_shape, geometry = _target(volume, spacing, shape, None if like is None else as_volume(like))
+    outside = _outside(volume, target_shape, geometry) if like is not None else None
+    if outside is not None and fill is None and boundary is not Boundary.WRAP and bool(outside.all()):
+        raise ValueError(
+            f"expected grids that overlap; got {volume} and, with no voxel in its box, {like} (or give fill)"
+        )
     if labels or as_method(method) is METHODS["nearest"]:
         if dtype not in (None, volume.dtype):
             raise ValueError(f"nearest samples and labels keep their type, {volume.dtype}; got dtype={dtype}")
         take = _labelled(method, prefilter) if labels else _nearest
         complete = Volume.with_geometry(_complete(volume.samples, nan), volume.geometry)
+        _check_fill(fill, volume.dtype)
         samples = take(complete, target_shape, geometry, boundary)
-        return Volume.with_geometry(samples, geometry)
+        return Volume.with_geometry(_filled(samples, outside, fill), geometry)
     needed = exact_float(volume.samples)
     dtype = dtype or needed
     if not dtype.is_floating_point:
@@ -85,7 +97,55 @@ def resample(
         nan=nan,
     )
     samples = _sampled(field, volume, target_shape, geometry, working)
-    return Volume.with_geometry(samples.to(dtype), geometry)
+    return Volume.with_geometry(_filled(samples.to(dtype), outside, fill), geometry)
+
+
+def _outside(volume: Volume, shape: tuple[int, int, int], geometry: Geometry) -> Tensor:
+    """Which voxel centres of another grid lie outside of a volume's box of voxels, (D, H, W)."""
+    device = volume.samples.device
+    steps = _aligned(volume.geometry, geometry)
+    if steps is not None:
+        out = torch.zeros((1, 1, 1), dtype=torch.bool, device=device)
+        for axis, (n, old) in enumerate(zip(shape[::-1], volume.size, strict=True)):
+            x = float(steps[0][axis]) * torch.arange(n, dtype=torch.float64, device=device) + float(steps[1][axis])
+            out = out | _beyond(x, old).reshape(-1, *(1 for _ in range(axis)))
+        return out.expand(shape)
+    parts = []
+    for positions in _positions(volume, shape, geometry):
+        x, y, z = (_beyond(p, n) for p, n in zip(positions, volume.size, strict=True))
+        parts.append(x | y | z)
+    return torch.cat(parts).reshape(shape)
+
+
+def _beyond(x: Tensor, n: int) -> Tensor:
+    return (x < -0.5 - NEARER) | (x > n - 0.5 + NEARER)
+
+
+def _positions(
+    volume: Volume, shape: tuple[int, int, int], geometry: Geometry
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Voxel coordinates x, y, z in a volume of the voxel centres of another grid, a million at a time."""
+    d, h, w = shape
+    device = volume.samples.device
+    matrix = torch.from_numpy(np.linalg.solve(volume.affine, geometry.affine)).to(device)
+    for begin in range(0, d * h * w, POINTS_AT_ONCE):
+        i = torch.arange(begin, min(begin + POINTS_AT_ONCE, d * h * w), device=device)
+        voxels = torch.stack((i % w, i // w % h, i // (w * h)), -1).to(torch.float64)
+        x, y, z = (voxels @ matrix[:3, :3].T + matrix[:3, 3]).unbind(-1)
+        yield x, y, z
+
+
+def _check_fill(fill: float | None, dtype: torch.dtype) -> None:
+    """Raises ValueError for a fill that the type of the result does not hold."""
+    if fill is None or dtype.is_floating_point:
+        return
+    info = torch.iinfo(dtype)
+    if fill != fill or fill in (math.inf, -math.inf) or fill != int(fill) or not info.min <= fill <= info.max:
+        raise ValueError(f"expected a fill that {dtype} holds; got {fill!r}")
+
+
+def _filled(samples: Tensor, outside: Tensor | None, fill: float | None) -> Tensor:
+    return samples if outside is None or fill is None else samples.masked_fill(outside, fill)
 
 
 def _sampled(
@@ -190,8 +250,6 @@ def _pointwise(
 
 # --- samples as they stand --------------------------------------------------------------------------------------------
 
-NEARER = 1e-9  # voxels: so much nearer may the earlier of two samples be, and still the later one is taken
-
 
 def _complete(samples: Tensor, nan: str) -> Tensor:
     """The samples with those that are missing filled in, or as they are where they may stay. Raises ValueError."""
@@ -203,15 +261,9 @@ def _nearest(volume: Volume, shape: tuple[int, int, int], geometry: Geometry, bo
     steps = _aligned(volume.geometry, geometry)
     if steps is not None:
         return _nearest_along_axes(volume, shape, steps, boundary)
-    d, h, w = shape
-    device, to_old = volume.samples.device, np.linalg.solve(volume.affine, geometry.affine)
-    matrix = torch.from_numpy(to_old).to(device)
     parts = []
-    for begin in range(0, d * h * w, POINTS_AT_ONCE):
-        i = torch.arange(begin, min(begin + POINTS_AT_ONCE, d * h * w), device=device)
-        voxels = torch.stack((i % w, i // w % h, i // (w * h)), -1).to(torch.float64)
-        x, y, z = (voxels @ matrix[:3, :3].T + matrix[:3, 3]).unbind(-1)
-        found = [_chosen(p, n, boundary) for p, n in zip((x, y, z), volume.size, strict=True)]
+    for positions in _positions(volume, shape, geometry):
+        found = [_chosen(p, n, boundary) for p, n in zip(positions, volume.size, strict=True)]
         part = volume.samples[..., found[2][0], found[1][0], found[0][0]]
         parts.append(part * (found[0][1] & found[1][1] & found[2][1]))
     samples = torch.cat(parts, -1)

@@ -344,6 +344,27 @@ def test_resample_like_another_volume(volume_file: Path, tmp_path: Path) -> None
     assert np.array_equal(load_volume(out).affine, load_volume(like).affine)
 
 
+def test_resample_fills_what_lies_outside(
+    capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path
+) -> None:
+    like, out = tmp_path / "like.nrrd", tmp_path / "out.nrrd"
+    source = load_volume(volume_file)
+    save_volume(Volume(torch.zeros(4, 5, 6), spacing=source.spacing, origin=(13, 20, 30)), like)
+    line = ["resample", str(volume_file), "-o", str(out), "--like", str(like)]
+    assert main([*line, "--fill", "-5"]) == 0
+    found = load_volume(out).samples
+    assert (found[..., 3:] == -5).all()
+    assert torch.allclose(found[..., :3], source.samples[..., 3:].float(), atol=1e-4)
+    assert main([*line, "--fill", "nan"]) == 0
+    assert load_volume(out).samples[..., 3:].isnan().all()
+    assert main([*line, "--fill", "250", "--dtype", "input"]) == 0
+    assert (load_volume(out).samples[..., 3:] == 250).all()
+    fails(capsys, [*line, "--fill", "nan", "--dtype", "input"], 1, "expected a --fill that uint8 holds; got nan")
+    save_volume(Volume(torch.zeros(4, 5, 6), origin=(1000, 0, 0)), like)
+    fails(capsys, line, 1, "expected grids that overlap")
+    assert main([*line, "--fill", "0"]) == 0
+
+
 def test_resample_tells_what_nifti_1_rounds(
     volume_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import product
 
 import numpy as np
@@ -193,3 +194,58 @@ def test_mistaken_targets():
         resample(x, shape=5)
     with pytest.raises(TypeError, match=r"expected a Volume or a torch\.Tensor; got str"):
         resample(x, like="x")
+
+
+# --- outside ----------------------------------------------------------------------------------------------------------
+
+
+def inside(source: Volume, like: Volume) -> torch.Tensor:
+    """Which voxel centres of `like` lie in the box of voxels of `source`, one by one."""
+    upper = torch.tensor(source.size) - 0.5
+    voxels = source.world_to_voxel(centres(like))
+    return ((voxels >= -0.5 - 1e-9) & (voxels <= upper + 1e-9)).all(-1)
+
+
+@pytest.mark.parametrize("fill", [0.0, -1000.0, math.nan, math.inf])
+@pytest.mark.parametrize("options", [{"method": "tricubic"}, {"method": "nearest"}, {"labels": True}])
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_lies_outside_has_the_value_of_fill(fill, options, turned):
+    source = Volume(volume(5, 6, 7).round(decimals=0), spacing=(1.0, 0.5, 2.0), origin=(3.0, -1.0, 0.0))
+    affine = rotated(origin=(2.0, -2.0, -1.0)) if turned else np.array(source.affine)
+    affine[:3, 3] -= 0 if turned else source.spacing  # half of the box, to the voxel
+    like = Volume(torch.zeros(6, 7, 8), affine=affine)
+    within = inside(source, like)
+    assert 0.1 < float(within.double().mean()) < 0.9
+    plain, found = resample(source, like=like, **options), resample(source, like=like, fill=fill, **options)
+    assert torch.equal(found.samples[within], plain.samples[within])
+    assert torch.equal(
+        found.samples[~within].nan_to_num(7.0), torch.full_like(found.samples[~within], fill).nan_to_num(7.0)
+    )
+    batch = Volume(source.samples.expand(2, 3, 5, 6, 7), affine=source.affine)
+    assert torch.equal(resample(batch, like=like, fill=fill, **options).samples[1, 2].isnan(), found.samples.isnan())
+
+
+def test_fill_leaves_what_has_no_outside_and_is_differentiable():
+    samples = volume(4, 5, 6).requires_grad_()
+    assert torch.equal(resample(samples, shape=(3, 7, 9), fill=9.0).samples, resample(samples, shape=(3, 7, 9)).samples)
+    like = Volume(torch.zeros(4, 5, 6), origin=(3, 0, 0))
+    resample(samples, "nearest", like=like, fill=5.0).samples.sum().backward()
+    assert samples.grad[..., :3].abs().max() == 0
+    assert (samples.grad[..., 3:] == 1).all()
+    for wrong in (0.5, math.nan, 256, -1):
+        with pytest.raises(ValueError, match=r"a fill that torch\.uint8 holds; got"):
+            resample(torch.zeros(2, 3, 4, dtype=torch.uint8), "nearest", like=like, fill=wrong)
+
+
+def test_grids_that_do_not_overlap_are_refused():
+    source = Volume(volume(4, 5, 6))
+    for affine in (np.diag([1.0, 1, 1, 1]), rotated()):
+        affine[:3, 3] = (100, 0, 0)
+        far = Volume(torch.zeros(3, 3, 3), affine=affine)
+        with pytest.raises(ValueError, match="grids that overlap"):
+            resample(source, like=far)
+        assert (resample(source, like=far, fill=2.0).samples == 2).all()
+        assert resample(source, like=far, boundary="wrap").samples.std() > 0
+    touching = Volume(torch.zeros(3, 3, 3), origin=(5.5, 0, 0))  # on the face of the box
+    assert resample(source, like=touching, fill=7.0).samples[0, 0].tolist()[1:] == [7, 7]
+    assert resample(source, like=touching).shape == (3, 3, 3)

@@ -133,7 +133,7 @@ def _information(path: Path, sitk: Any, name: str) -> Any:
     try:
         reader.ReadImageInformation()
     except RuntimeError as error:
-        raise VolumeFileError(path, f"a {kind_of(path)} file that ITK reads", _reason(error)) from None
+        raise VolumeFileError(path, f"{kind_of(path)} data that ITK reads", _reason(error)) from None
     return reader
 
 

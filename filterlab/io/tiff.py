@@ -83,8 +83,8 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
 
 def _told(page: Page) -> FirstPage:
     plane, file = page.plane, page.directory.file
-    text = page.directory.text(DESCRIPTION, MAX_OME)
-    return FirstPage(file.path, text, plane.samples, page.size, (plane.rows, plane.columns))
+    content = page.directory.content(DESCRIPTION, MAX_OME)
+    return FirstPage(file.path, content, plane.samples, page.size, (plane.rows, plane.columns))
 
 
 def _layout(told: FirstPage, planes: int, files: int) -> Layout:

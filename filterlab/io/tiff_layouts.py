@@ -12,18 +12,20 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 
 from filterlab.io.bounded import VolumeFileError, integer, number
+from filterlab.io.tiff_pages import MAX_TEXT, as_text
 from filterlab.io.warned import warn
 
 ORDER = ("frames", "channels", "slices")
-MAX_OME = 2**22  # characters of XML that is taken apart
-MAX_PLANES = 2**20
+MAX_OME = 2**22  # bytes of XML that is taken apart
+_PLACES = ("FirstZ", "FirstC", "FirstT", "IFD", "PlaneCount")
 # Micrometres in the units of lengths that OME knows and people use.
 UNITS = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _JSON_AXES = {"T": "frames", "C": "channels", "Z": "slices", "Q": "", "I": "", "?": ""}  # the last three: not said
@@ -49,14 +51,26 @@ class Layout:
 
 @dataclass(frozen=True)
 class FirstPage:
-    """What the first page of a file says: its path, description, values per pixel, width and height of a pixel by its
-    resolution, and rows and columns."""
+    """What the first page of a file says.
+
+    Attributes:
+        path: the file.
+        content: its description, as far as MAX_OME.
+        samples: values per pixel.
+        size: width and height of a pixel by its resolution.
+        shape: rows and columns.
+    """
 
     path: Path
-    description: str
+    content: bytes
     samples: int
     size: tuple[float, float]
     shape: tuple[int, int]
+
+    @cached_property
+    def description(self) -> str:
+        """The beginning of the description, of which people and programs other than OME need no more."""
+        return as_text(self.content[:MAX_TEXT])
 
     @property
     def imagej(self) -> dict[str, str]:
@@ -69,13 +83,21 @@ class FirstPage:
         """How many planes ImageJ says that there are."""
         return integer(self.path, "ImageJ images", self.imagej.get("images", str(default)).strip())
 
+    @property
+    def _is_ome(self) -> bool:
+        """Whether it is OME-XML, cut off or whole."""
+        if not self.content[:64].lstrip().startswith(b"<"):
+            return False
+        cut = len(self.content) >= MAX_OME
+        return b"OME" in self.content[:MAX_TEXT] if cut else self.content[-64:].rstrip().endswith(b"OME>")
+
     def layout(self, pages: int) -> Layout:
         """The layout of so many pages. Raises VolumeFileError where they are not what the description says."""
         text = self.description.strip()
         if self.imagej:
             return self._of_imagej(pages)
-        if text.startswith("<") and text.endswith("OME>"):
-            return self._of_ome(text, pages)
+        if self._is_ome:
+            return self._of_ome(pages)
         if text.startswith(('{"shape":', "shape=(")):
             return self._of_json(text, pages)
         return Layout(np.arange(pages).reshape(1, 1, pages))
@@ -154,8 +176,9 @@ class FirstPage:
 
     # --- OME ----------------------------------------------------------------------------------------------------------
 
-    def _of_ome(self, text: str, pages: int) -> Layout:
-        pixels = self._pixels(text)
+    def _of_ome(self, pages: int) -> Layout:
+        described = self._described(pages)
+        pixels = described.pixels
         counts = {axis: self._count(pixels, f"Size{axis}") for axis in "XYZCT"}
         if (counts["Y"], counts["X"]) != self.shape:
             raise VolumeFileError(self.path, f"pages of {self.shape}, as OME says", (counts["Y"], counts["X"]))
@@ -165,52 +188,47 @@ class FirstPage:
         if counts["C"] % self.samples:
             raise VolumeFileError(self.path, f"channels in pages of {self.samples}", counts["C"])
         counts["C"] //= self.samples
-        if (planes := math.prod(counts[axis] for axis in "TCZ")) > MAX_PLANES:
-            raise VolumeFileError(self.path, f"at most {MAX_PLANES} planes", planes)
+        planes = math.prod(counts[axis] for axis in "TCZ")
+        expected = f"all {planes} planes of its OME description in this file"
+        if planes > pages:
+            raise VolumeFileError(self.path, expected, pages)
         table = np.full(tuple(counts[axis] for axis in order[:1:-1]), -1)  # slowest first
-        for entry in (child for child in pixels if _name(child) == "TiffData"):
+        for entry in described.entries or [{}]:
             self._place(entry, table, order, pages)
-        if not any(_name(child) == "TiffData" for child in pixels):
-            table.flat[: min(pages, planes)] = np.arange(min(pages, planes))
         if (missing := int((table < 0).sum())) > 0:
-            expected = f"all {planes} planes of its OME description in this file"
             raise VolumeFileError(self.path, expected, planes - missing)
         if pages > planes:
             warn(self.path, f"passed over {pages - planes} pages that its OME description does not name")
         spacing, unit = self._physical_size(pixels)
         return Layout(np.transpose(table, [order[:1:-1].index(axis) for axis in "TCZ"]), spacing, unit)
 
-    def _pixels(self, text: str) -> Any:
-        """The one element Pixels."""
-        if len(text) >= MAX_OME:
-            raise VolumeFileError(self.path, f"an OME description of at most {MAX_OME} characters", "more")
-        if "<!" in text.replace("<!--", ""):  # no entities, nothing that expands
-            raise VolumeFileError(self.path, "OME-XML without a document type", "one")
+    def _described(self, pages: int) -> Description:
+        """What OME-XML says. Raises VolumeFileError."""
+        if len(self.content) >= MAX_OME:
+            raise VolumeFileError(self.path, f"an OME description of at most {MAX_OME} bytes", "more")
+        found = Description(pages)
         try:
-            root = ElementTree.fromstring(text.encode())
-        except (ElementTree.ParseError, ValueError, LookupError) as error:
-            raise VolumeFileError(self.path, "well-formed OME-XML", str(error)[:100]) from None
-        found = [element for element in root.iter() if _name(element) == "Pixels"]
-        if len(found) != 1:
-            raise VolumeFileError(self.path, "one image in its OME description", len(found))
-        if any(_name(element).startswith("ModuloAlong") for element in root.iter()):
-            raise VolumeFileError(self.path, "axes of space, time and channels", "others (ModuloAlong) in its OME-XML")
-        return found[0]
+            found.read(self.content)
+        except (expat.ExpatError, ValueError, LookupError) as error:
+            found.refused = found.refused or ("well-formed OME-XML", str(error)[:100])
+        if found.refused:
+            raise VolumeFileError(self.path, *found.refused)
+        if found.images != 1:
+            raise VolumeFileError(self.path, "one image in its OME description", found.images)
+        return found
 
-    def _count(self, element: Mapping[str, str] | Any, name: str) -> int:
-        value = integer(self.path, name, str(element.get(name, "missing")).strip())
+    def _count(self, pixels: Mapping[str, str], name: str) -> int:
+        value = integer(self.path, name, pixels.get(name, "missing").strip())
         if value < 1:
             raise VolumeFileError(self.path, f"{name} of 1 or more", value)
         return value
 
-    def _place(self, entry: Any, table: np.ndarray, order: str, pages: int) -> None:
+    def _place(self, entry: Mapping[str, str], table: np.ndarray, order: str, pages: int) -> None:
         """Writes the pages of one element TiffData into the table of planes."""
-        for child in entry:
-            name = child.get("FileName", self.path.name)
-            if _name(child) == "UUID" and Path(name).name != self.path.name:
-                raise VolumeFileError(self.path, "an OME-TIFF of one file", f"planes in {name!r}"[:120])
-        names = ("FirstZ", "FirstC", "FirstT", "IFD", "PlaneCount")
-        said = {name: integer(self.path, name, entry.get(name).strip()) for name in names if entry.get(name)}
+        name = entry.get("FileName", self.path.name)
+        if Path(name).name != self.path.name:
+            raise VolumeFileError(self.path, "an OME-TIFF of one file", f"planes in {name!r}"[:120])
+        said = {name: integer(self.path, name, entry[name].strip()) for name in _PLACES if name in entry}
         first = {axis: said.get(f"First{axis}", 0) for axis in "ZCT"}
         first["C"] //= self.samples
         at = tuple(first[axis] for axis in order[:1:-1])
@@ -223,7 +241,7 @@ class FirstPage:
             raise VolumeFileError(self.path, f"TiffData within its {pages} pages", f"{count} from page {page}")
         table.flat[start : start + count] = np.arange(page, page + count)
 
-    def _physical_size(self, pixels: Any) -> tuple[tuple[float, float, float], str | None]:
+    def _physical_size(self, pixels: Mapping[str, str]) -> tuple[tuple[float, float, float], str | None]:
         """Of a voxel, in the unit of x; 1 where nothing is said."""
         sizes, units = [], []
         for axis in "XYZ":
@@ -249,9 +267,46 @@ class FirstPage:
         return (x, y, z), _unit(units[0]) if known else None
 
 
-def _name(element: Any) -> str:
-    """Of an XML element, without its namespace."""
-    return str(element.tag).rsplit("}", 1)[-1]
+class Description:
+    """What OME-XML says of pixels and of the pages that hold them; of all else nothing is kept.
+
+    Attributes:
+        images: how many there are.
+        pixels: the attributes of the first one's pixels.
+        entries: of each element TiffData its numbers, and `FileName`; at most as many as there are pages.
+        refused: what is expected and what came, where something is not read.
+    """
+
+    def __init__(self, pages: int) -> None:
+        self.images, self.pages = 0, pages
+        self.pixels: dict[str, str] = {}
+        self.entries: list[dict[str, str]] = []
+        self.refused: tuple[str, str] | None = None
+
+    def read(self, content: bytes) -> None:
+        """Takes it apart. Raises expat's errors where it is no XML."""
+        parser = expat.ParserCreate()
+        parser.StartElementHandler = self._begin
+        parser.StartDoctypeDeclHandler = self._doctype  # no entities, nothing that expands
+        parser.Parse(content, True)
+
+    def _doctype(self, *_: Any) -> None:
+        self.refused = self.refused or ("OME-XML without a document type", "one")
+        raise ValueError("a document type")
+
+    def _begin(self, name: str, attributes: dict[str, str]) -> None:
+        name = name.rsplit(":", 1)[-1]  # without its namespace
+        if name == "Pixels":
+            self.images += 1
+            self.pixels = self.pixels or attributes
+        elif name == "TiffData":
+            if len(self.entries) == self.pages:
+                raise ValueError(f"more TiffData than its {self.pages} pages")
+            self.entries.append({key: attributes[key] for key in _PLACES if key in attributes})
+        elif name == "UUID" and self.entries and "FileName" in attributes:
+            self.entries[-1]["FileName"] = attributes["FileName"]
+        elif name.startswith("ModuloAlong"):
+            self.refused = self.refused or ("axes of space, time and channels", "others (ModuloAlong) in its OME-XML")
 
 
 def _unit(text: object) -> str | None:

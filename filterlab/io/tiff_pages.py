@@ -249,6 +249,14 @@ def decoded_page(path: Path, index: int, encoding: str) -> np.ndarray:
         raise VolumeFileError(path, f"intact {encoding} data", got) from None
 
 
+def as_text(content: bytes) -> str:
+    """UTF-8, or what old writers on Windows used."""
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError:
+        return content.decode("cp1252", "replace")
+
+
 @lru_cache
 def _dtype(order: str, kind: str, itemsize: int) -> np.dtype:
     """The type of samples; nothing that anyone can add up, where NumPy has none."""
@@ -342,18 +350,20 @@ class Directory:
         meaning = _PHOTOMETRIC.get(self.number(PHOTOMETRIC, 1))
         return {"photometric": meaning} if meaning else {}
 
-    def text(self, tag: int, most: int = MAX_TEXT) -> str:
-        """The beginning of a text; empty where there is none. Raises VolumeFileError."""
+    def content(self, tag: int, most: int) -> bytes:
+        """The beginning of a text, as it stands; empty where there is none. Raises VolumeFileError."""
         kind, n, at = self.tags.get(tag, (2, 0, 0))
         if kind not in (1, 2, 7) or at + n > self.file.length:
             raise VolumeFileError(
                 self.file.path, f"tag {tag} within its {self.file.length} bytes", f"{n} values at {at}"
             )
-        content = _exactly(self.file.stream, at, min(n, most)).split(b"\0")[0]
-        try:
-            return content.decode("utf-8")
-        except UnicodeDecodeError:
-            return content.decode("cp1252", "replace")
+        content = _exactly(self.file.stream, at, min(n, most))
+        end = content.find(b"\0")
+        return content if end < 0 else content[:end]
+
+    def text(self, tag: int) -> str:
+        """The beginning of a text; empty where there is none. Raises VolumeFileError."""
+        return as_text(self.content(tag, MAX_TEXT))
 
     def page(self) -> Page:
         """The page, once its claims are known to be possible. Raises VolumeFileError."""

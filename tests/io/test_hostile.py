@@ -743,6 +743,24 @@ def test_strips_that_hold_much_and_are_little(tmp_path: Path) -> None:
     refused(path, "pages of", action=describe)
 
 
+@pytest.mark.parametrize("element", [b"<a/>", b"<TiffData/>", b"<Channel ID='1'/>", b"<!-- -->", b"&lt;"])
+def test_ome_xml_of_many_small_things(tmp_path: Path, element: bytes) -> None:
+    """A tree of them takes a hundred times their bytes."""
+    path, start = tmp_path / "a.tif", b"<OME><Pixels SizeX='4' SizeY='4' SizeZ='2' SizeC='1' SizeT='1'>"
+    count = 4_000_000 // len(element)
+    text = start + count * element + b"</Pixels></OME>"
+    path.write_bytes(tiff_of(4, 4, more=text, strip=bytes(16), description=(270, 2, len(text), -1)))
+    tracemalloc.start()
+    with contextlib.suppress(VolumeFileError):
+        assert describe(path).shape == (2, 4, 4)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * 2**20 + 2 * path.stat().st_size
+    text = text.replace(b"</Pixels>", b"x" * 2**18 + b"</Pixels>")
+    path.write_bytes(tiff_of(4, 4, more=text, strip=bytes(16), description=(270, 2, len(text), -1)))
+    refused(path, "an OME description of at most 4194304 bytes", action=describe)
+
+
 def test_directories_of_very_many_tags(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     entries = struct.pack("<HHII", 65000, 4, 1, 0) * 60_000

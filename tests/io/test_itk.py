@@ -184,7 +184,7 @@ def test_headers_that_lie_to_itk(tmp_path: Path) -> None:
     with pytest.raises(VolumeFileError, match="ElementDataFile"):
         load_volume(tmp_path / "b.mha")
     (tmp_path / "b.gipl").write_bytes(b"no header")
-    with pytest.raises(VolumeFileError, match="a gipl file that ITK reads"):
+    with pytest.raises(VolumeFileError, match="gipl data that ITK reads"):
         load_volume(tmp_path / "b.gipl")
 
 
