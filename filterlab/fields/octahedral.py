@@ -22,7 +22,7 @@ with the symmetry of the octahedra and these supports, the one that is C¹ and r
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from itertools import product
 
@@ -31,7 +31,7 @@ from torch import Tensor
 
 from filterlab.bernstein import Index, multi_indices
 from filterlab.fields.determining import Determining, moved
-from filterlab.fields.tetrahedral import Mask, Shape, Spline, Vector, weighted
+from filterlab.fields.tetrahedral import Jets, Mask, Shape, Spline, Vector, weighted
 
 Centre = tuple[int, int, int]
 Weights = tuple[int, int, int, int]
@@ -69,9 +69,6 @@ _F: Mask = {_half(s): Fraction(1, 8) for s in _SIGNS}
 _G: tuple[Mask, ...] = tuple({_half(s): Fraction(s[axis], 4) for s in _SIGNS} for axis in range(3))
 """Value and gradient at a centre."""
 
-Jets = Mapping[tuple[Centre, int], Fraction]
-"""A centre, and which of (f, g) there -> its weight."""
-
 
 def _linear(c: Centre, v: Vector) -> Jets:
     """T((c + v) / 2) = f + g · (v − c) / 2."""
@@ -106,7 +103,7 @@ def _octahedra(x: Tensor) -> Tensor:
 
 _SHAPES, _RULES = zip(*map(_of_kind, _KINDS), strict=True)
 
-QUADRATIC_C1 = Spline("quadratic-c1", 2, _SHAPES, _octahedra, Fraction(1, 2), 2, _CENTRES, 2)
+QUADRATIC_C1 = Spline("quadratic-c1", 2, _SHAPES, _octahedra, Fraction(1, 2), 2, _CENTRES, 2, _RULES)
 """Quadratic splines, C¹ everywhere."""
 
 JETS = Determining.of_rows(QUADRATIC_C1, (_F, *_G), _RULES)

@@ -48,6 +48,13 @@ Mask = Mapping[Vector, Fraction]
 Key = TypeVar("Key", bound=Hashable)
 
 
+Jets = Mapping[tuple[tuple[int, int, int], int], Fraction]
+"""A centre, and which of (f, ∂_x f, ∂_y f, ∂_z f) there -> its weight."""
+
+Rule = Mapping[tuple[int, tuple[int, int, int]], Fraction]
+"""One of `Tetrahedra.inputs` -> its weight."""
+
+
 def weighted(*parts: tuple[Fraction, Mapping[Key, Fraction]]) -> dict[Key, Fraction]:
     """Σ factor · mask, without the samples whose weights cancel."""
     total: dict[Key, Fraction] = {}
@@ -124,6 +131,7 @@ class Spline:
         shift: the centre of a cell lies at cell + shift along every axis: 0 or ½.
         period: how far the partition has to be moved along an axis to lie on itself: 1 or 2.
         centres, size: of the cubes of size³ samples that all tetrahedra of the cone need, relative to the centre.
+        jets: for every shape its coefficients by value and gradient at these centres, of cubes of 2³ samples.
 
     Raises ValueError where a shape has not a mask for every coefficient, or not the samples of the others.
     """
@@ -136,6 +144,7 @@ class Spline:
     period: int
     centres: tuple[tuple[int, int, int], ...]
     size: int
+    jets: tuple[Mapping[Index, Jets], ...] | None = None
 
     def __post_init__(self) -> None:
         for shape in self.shapes:
@@ -178,19 +187,34 @@ class Spline:
     def lowered(self) -> Tetrahedra:
         """All of it as `ops` sums it."""
         indices = multi_indices(self.degree, 3)
+        inputs = sorted({key for rule in self._rules for mask in rule.values() for key in mask})
         masks: dict[tuple[float, ...], int] = {}
-        rows = [tuple(masks.setdefault(s.row(a, self.samples), len(masks)) for a in indices) for s in self.shapes]
+        weights = [[tuple(float(rule[a].get(key, 0)) for key in inputs) for a in indices] for rule in self._rules]
+        rows = tuple(tuple(masks.setdefault(own, len(masks)) for own in shape) for shape in weights)
         return Tetrahedra(
             octahedral=self.period == 2,
             degree=self.degree,
-            centres=tuple((int(x), int(y), int(z)) for x, y, z in self.centres),
+            centres=self.centres,
             size=self.size,
-            samples=tuple(map(self._place_in_blocks, self.samples)),
+            inputs=tuple(inputs),
             masks=tuple(masks),
-            rows=tuple(rows),
+            rows=rows,
             barycentric=tuple(tuple(tuple(map(float, row)) for row in s.barycentric) for s in self.shapes),
+            norm=float(self.norm),
             cuts=tuple((normal, float(d)) for normal, d in sorted(self._cuts())),
         )
+
+    @property
+    def _rules(self) -> list[Mapping[Index, Rule]]:
+        """For every shape its coefficients, of the numbers that `Tetrahedra.inputs` describes."""
+        if self.jets is not None:
+            return [{a: self._of_jets(jets) for a, jets in rules.items()} for rules in self.jets]
+        return [{a: {(0, _place(o)): w for o, w in mask.items()} for a, mask in s.masks.items()} for s in self.shapes]
+
+    def _of_jets(self, jets: Jets) -> Rule:
+        numbers = {centre: number for number, centre in enumerate(self.centres)}
+        parts = ((0, 0, 0), 8), ((1, 0, 0), 4), ((0, 1, 0), 4), ((0, 0, 1), 4)
+        return {(numbers[c], parts[n][0]): weight / parts[n][1] for (c, n), weight in jets.items()}
 
     def _cuts(self) -> set[tuple[Normal, Fraction]]:
         """The planes of faces within the cube about the sample 0, in which no tetrahedron lies partly."""
@@ -206,14 +230,11 @@ class Spline:
                         found.add(plane)
         return found
 
-    def _place_in_blocks(self, sample: Vector) -> tuple[int, tuple[int, int, int]]:
-        """The block that a sample is in, the first one, and its place there."""
-        half = Fraction(self.size - 1, 2)
-        for number, centre in enumerate(self.centres):
-            x, y, z = (o - c + half for o, c in zip(sample, centre, strict=True))
-            if all(0 <= place <= 2 * half for place in (x, y, z)):
-                return number, (int(x), int(y), int(z))
-        raise ValueError(f"{self.name}: no block of samples has the one at {tuple(map(str, sample))}")
+
+def _place(sample: Vector) -> tuple[int, int, int]:
+    """In the block of 3³ about the centre."""
+    x, y, z = (int(o) + 1 for o in sample)
+    return x, y, z
 
 
 Normal = tuple[int, int, int]

@@ -33,6 +33,8 @@ Steps = tuple[int, int, int]
 Block = dict[Steps, Value]
 """Samples by their places along three axes."""
 
+_UNITS: tuple[Steps, ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+
 Rows = dict[MultiIndex, Value]
 """All partial derivatives of some orders, each order whole."""
 
@@ -65,12 +67,14 @@ class Tetrahedra:
         degree: n.
         centres: of the blocks of size³ samples that one tetrahedron needs, in steps along the cone's axes from the
             centre of the cell.
-        size: 2 or 3.
-        samples: which K samples of these, each as the number of its block and its place there, 0 … size − 1 along the
-            cone's axes.
+        size: 3, or 2: of a block of 2³ all that counts is what it tells of its centre, eight times the value and four
+            times the gradient there, by differences.
+        inputs: the K numbers that coefficients are made of, each as the number of its block and, along the cone's axes,
+            its place there, 0 … 2; or which of value and gradient, (0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1).
         masks: R different ones, of K weights each.
         rows: for every shape, which of the masks its B Bernstein coefficients are.
         barycentric: for every shape 4 rows (d, n), λ_k = d + n · x.
+        norm: no value is larger than this times the largest sample.
         cuts: planes (n, d), n · v = d, that cut the cube |v| ≤ ½ about a sample into parts of one tetrahedron each; of
             octahedra about a sample at even indices, v turned round along the axes of odd ones.
     """
@@ -79,25 +83,12 @@ class Tetrahedra:
     degree: int
     centres: tuple[Steps, ...]
     size: int
-    samples: tuple[tuple[int, Steps], ...]
+    inputs: tuple[tuple[int, Steps], ...]
     masks: tuple[tuple[float, ...], ...]
     rows: tuple[tuple[int, ...], ...]
     barycentric: tuple[tuple[tuple[float, ...], ...], ...]
+    norm: float
     cuts: tuple[tuple[Steps, float], ...]
-
-    @cached_property
-    def steps(self) -> tuple[Steps, ...]:
-        """Where the samples lie along the cone's axes, from a cube's centre, from ½ before an octahedron's."""
-        return tuple(self._step(self.centres[block], place) for block, place in self.samples)
-
-    def _step(self, centre: Steps, place: Steps) -> Steps:
-        x, y, z = (c + p - self.before for c, p in zip(centre, place, strict=True))
-        return x, y, z
-
-    @property
-    def norm(self) -> float:
-        """No value is larger than this times the largest sample."""
-        return max(math.fsum(map(abs, mask)) for mask in self.masks)
 
     @cached_property
     def masks_of_cube(self) -> tuple[tuple[float, ...], ...]:
@@ -105,7 +96,7 @@ class Tetrahedra:
         places, middle, found = list(product(range(self.size), repeat=3)), (self.size - 1) / 2, {}
         for mask, axes, signs in product(self.masks, permutations(range(3)), product((1, -1), repeat=3)):
             weights = {}
-            for weight, (_, at) in zip(mask, self.samples, strict=True):
+            for weight, (_, at) in zip(mask, self.inputs, strict=True):
                 weights[tuple(int(middle + s * (at[a] - middle)) for a, s in zip(axes, signs, strict=True))] = weight
             found[tuple(weights.get(place, 0.0) for place in places)] = None
         return tuple(found)
@@ -436,32 +427,24 @@ class Sum:
 
     def contract(self, blocks: Sequence[Block], turned: Turned) -> list[Value]:
         """The rows of the stencil, from blocks of samples along the axes of space."""
-        return self.contract_samples(self._samples(blocks, turned), turned)
-
-    def _samples(self, blocks: Sequence[Block], turned: Turned) -> list[Value]:
-        along = [self._sorted(self._mirrored(block, turned), turned) for block in blocks]
-        return [along[block][at] for block, at in self.spline.samples]
-
-    def _coefficients(self, samples: Sequence[Value], turned: Turned) -> list[Value]:
-        masks = [self._weighted(mask, samples) for mask in self.spline.masks]
-        return [self.by_shape(turned, [masks[r] for r in own]) for own in zip(*self.spline.rows, strict=True)]
+        e, rows, pieces = self.arithmetic, {}, self._coefficients(blocks, turned)
+        for order in range(self.spline.degree, -1, -1):
+            if order < self.spline.degree:
+                pieces = [self._step(pieces, row, turned.barycentric) for row in _steps(order + 1)]
+            if order in self.stencil.orders:
+                rows |= {m: self._derivative(pieces, m, turned) for m in self.stencil.rows if sum(m) == order}
+        found = self._signed(self._unsorted(rows, turned), turned)
+        return [e.add(found[m], turned.nothing) if m in found else turned.nothing for m in self.stencil.rows]
 
     def restrict(
         self, blocks: Sequence[Block], turned: Turned, start: Sequence[Value], end: Sequence[Value]
     ) -> list[Value]:
-        """The n + 1 Bernstein coefficients of the value between two points, λ in the tetrahedra of those turned."""
-        return self._restricted(self._coefficients(self._samples(blocks, turned), turned), start, end)
+        """The n + 1 Bernstein coefficients of the value between two points, λ in the tetrahedra of those turned.
 
-    def restrict_samples(
-        self, samples: Sequence[Value], turned: Turned, start: Sequence[Value], end: Sequence[Value]
-    ) -> list[Value]:
-        """The same, from the K samples that the tetrahedron of each point needs."""
-        return self._restricted(self._coefficients(samples, turned), start, end)
-
-    def _restricted(self, pieces: list[Value], start: Sequence[Value], end: Sequence[Value]) -> list[Value]:
-        """The blossom n − j times at the start and j times at the end, for j = 0 … n."""
+        They are the blossom n − j times at the start and j times at the end, for j = 0 … n.
+        """
         degree = self.spline.degree
-        found = {(0, 0): pieces}
+        found = {(0, 0): self._coefficients(blocks, turned)}
 
         def blossom(a: int, b: int) -> list[Value]:
             if (a, b) not in found:  # of both the one that is asked more often comes first: fewer are needed
@@ -472,16 +455,38 @@ class Sum:
 
         return [blossom(degree - j, j)[0] for j in range(degree + 1)]
 
-    def contract_samples(self, samples: Sequence[Value], turned: Turned) -> list[Value]:
-        """The same, from the K samples that the tetrahedron of each point needs."""
-        e, rows, pieces = self.arithmetic, {}, self._coefficients(samples, turned)
-        for order in range(self.spline.degree, -1, -1):
-            if order < self.spline.degree:
-                pieces = [self._step(pieces, row, turned.barycentric) for row in _steps(order + 1)]
-            if order in self.stencil.orders:
-                rows |= {m: self._derivative(pieces, m, turned) for m in self.stencil.rows if sum(m) == order}
-        found = self._signed(self._unsorted(rows, turned), turned)
-        return [e.add(found[m], turned.nothing) if m in found else turned.nothing for m in self.stencil.rows]
+    def _coefficients(self, blocks: Sequence[Block], turned: Turned) -> list[Value]:
+        along = [self._along_cone(block, turned) for block in blocks]
+        inputs = [along[block][at] for block, at in self.spline.inputs]
+        masks = [self._weighted(mask, inputs) for mask in self.spline.masks]
+        return [self.by_shape(turned, [masks[r] for r in own]) for own in zip(*self.spline.rows, strict=True)]
+
+    def _along_cone(self, block: Block, turned: Turned) -> Rows:
+        if self.spline.size == 2:
+            return self._sorted(self._signed(self._at_centre(block), turned), turned)
+        return self._sorted(self._mirrored(block, turned), turned)
+
+    def _at_centre(self, block: Block) -> Rows:
+        """Eight times the value and four times the gradient at the centre of 2³ samples."""
+        e = self.arithmetic
+        rows: Rows = {(0, 0, 0): None}
+        for axis, unit in enumerate(_UNITS):
+            ends: list[Value] = [None, None]
+            for at, sample in block.items():
+                self._add(ends, at[axis], sample)
+            rows[unit] = e.subtract(ends[1], ends[0])
+            rows[0, 0, 0] = e.add(ends[0], ends[1])
+        return rows
+
+    def _from_centre(self, rows: Rows) -> Block:
+        """The transpose."""
+        e, block = self.arithmetic, {}
+        for at in self.places:
+            total = rows[0, 0, 0]
+            for axis, unit in enumerate(_UNITS):
+                total = (e.add if at[axis] else e.subtract)(total, rows[unit])
+            block[at] = total
+        return block
 
     def _weighted(self, weights: Sequence[float], values: Sequence[Value]) -> Value:
         """Σ weight · value; None where there is no weight."""
@@ -512,13 +517,20 @@ class Sum:
 
     def spread(self, cotangents: Sequence[Value], turned: Turned) -> list[Block]:
         """The transpose of `contract`: what is added to blocks of samples; None where that is nothing."""
-        along: list[Block] = [dict.fromkeys(self.places) for _ in self.spline.centres]  # type: ignore[misc]
-        for (block, at), value in zip(self.spline.samples, self.spread_samples(cotangents, turned), strict=True):
+        units = ((0, 0, 0), *_UNITS) if self.spline.size == 2 else self.places
+        along: list[Rows] = [dict.fromkeys(units) for _ in self.spline.centres]  # type: ignore[misc]
+        for (block, at), value in zip(self.spline.inputs, self._spread_inputs(cotangents, turned), strict=True):
             along[block][at] = value
-        return [self._mirrored(self._unsorted(block, turned), turned) for block in along]
+        return [self._from_cone(own, turned) for own in along]
 
-    def spread_samples(self, cotangents: Sequence[Value], turned: Turned) -> list[Value]:
-        """The same for the K samples that the tetrahedron of each point needs."""
+    def _from_cone(self, along: Rows, turned: Turned) -> Block:
+        if self.spline.size == 2:
+            zero = self.arithmetic.constant(0)
+            whole = {m: zero if row is None else row for m, row in along.items()}
+            return self._from_centre(self._signed(self._unsorted(whole, turned), turned))
+        return self._mirrored(self._unsorted(along, turned), turned)
+
+    def _spread_inputs(self, cotangents: Sequence[Value], turned: Turned) -> list[Value]:
         degree = self.spline.degree
         given = {m: own for m, own in zip(self.stencil.rows, cotangents, strict=True) if sum(m) <= degree}
         rows = self._sorted(self._signed(given, turned), turned)

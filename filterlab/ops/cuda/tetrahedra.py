@@ -1,15 +1,15 @@
 """The sums of splines on tetrahedra in Triton: `ops.tetrahedra.Sum`, line by line; what `taps` is for sums over taps.
 
-Each thread reads the samples of its own tetrahedron, along axes that are turned into the cone already.
+Each thread reads the blocks of samples that its own tetrahedron needs, one sample at a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from filterlab.ops.cuda.source import Source, number
 from filterlab.ops.cuda.taps import AXES, SIZES, first_taps
-from filterlab.ops.tetrahedra import Sum, TetrahedralStencil
+from filterlab.ops.tetrahedra import Steps, Sum, TetrahedralStencil
 
 
 class Text:
@@ -81,23 +81,32 @@ class TetrahedralTaps:
         self.turned = self.sum.turn([f"u{axis}" for axis in AXES])
         signed = [text.where(n, f"-({s})", s) for n, s in zip(self.turned.negative, strides, strict=True)]
         along = self.sum.along_cone(self.turned, signed)
-        halves = " + ".join(f"{step} - {axis}" for step, axis in zip(strides, signed, strict=True))
-        begin = text.named(f"({halves}) // 2" if self.sum.spline.octahedral else "ux.to(tl.int64) * 0")
-        self.offsets = [self._moved(begin, along, steps) for steps in self.sum.spline.steps]
+        lowest = f"-{self.sum.spline.before} * (1 + width + width * height)"
+        self.corners = [self._corner(lowest, along, centre) for centre in self.sum.spline.centres]
 
-    def _moved(self, begin: str, along: Sequence[str], steps: Sequence[int]) -> str:
-        terms = [f"{step} * {axis}" for step, axis in zip(steps, along, strict=True) if step]
-        return self.text.named(" + ".join([begin, *terms]))
+    def _corner(self, lowest: str, along: Sequence[str], centre: Sequence[int]) -> str:
+        """Where a block of samples begins, from the coefficient of the cell's index."""
+        terms = [f"{step} * {axis}" for step, axis in zip(centre, along, strict=True) if step]
+        return self.text.named(" + ".join([lowest, *terms]))
 
     def contract(self, tap: str, rows: str = "row") -> None:
         """See `Taps.contract`."""
-        samples = [self.text.named(f"tl.load({tap} + {offset}).to(arithmetic)") for offset in self.offsets]
-        for r, row in enumerate(self.sum.contract_samples(samples, self.turned)):
+        blocks = [
+            {at: self.text.named(f"tl.load({place}).to(arithmetic)") for at, place in self._places(tap, corner)}
+            for corner in self.corners
+        ]
+        for r, row in enumerate(self.sum.contract(blocks, self.turned)):
             self.source.line(f"{rows}_{r} = {row}")
 
     def spread(self, tap: str, mask: str, rows: str = "row") -> None:
         """See `Taps.spread`."""
         cotangents = [f"{rows}_{r}" for r in range(len(self.stencil.rows))]
-        for offset, value in zip(self.offsets, self.sum.spread_samples(cotangents, self.turned), strict=True):
-            if value is not None:
-                self.source.line(f'tl.atomic_add({tap} + {offset}, {value}, {mask}, sem="relaxed")')
+        for corner, block in zip(self.corners, self.sum.spread(cotangents, self.turned), strict=True):
+            for at, place in self._places(tap, corner):
+                if block[at] is not None:
+                    self.source.line(f'tl.atomic_add({place}, {block[at]}, {mask}, sem="relaxed")')
+
+    def _places(self, tap: str, corner: str) -> Iterator[tuple[Steps, str]]:
+        """The addresses of a block's samples."""
+        for i, j, k in self.sum.places:
+            yield (i, j, k), f"{tap} + {corner} + ({i} + {j} * width + {k} * (width * height))"
