@@ -13,10 +13,11 @@ which each has the same tetrahedra under the signed permutations of the axes, de
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from itertools import permutations, product
+from itertools import combinations, permutations, product
 from typing import Any, Protocol
 
 from torch import Tensor
@@ -89,6 +90,31 @@ class Tetrahedra:
     barycentric: tuple[tuple[tuple[float, ...], ...], ...]
     norm: float
     cuts: tuple[tuple[Steps, float], ...]
+
+    @cached_property
+    def shared(self) -> tuple[tuple[tuple[int, int, int], ...], tuple[tuple[float, ...], ...]]:
+        """The masks with sums and differences that several of them have computed once.
+
+        Returns:
+            steps (i, j, ±1), each one input more, input i ± input j; and the masks of all of these.
+        """
+        masks, steps, count = [{k: w for k, w in enumerate(mask) if w} for mask in self.masks], [], len(self.inputs)
+        while True:
+            pairs = Counter(
+                (i, j, 1 if mask[i] == mask[j] else -1)
+                for mask in masks
+                for i, j in combinations(sorted(mask), 2)
+                if abs(mask[i]) == abs(mask[j])
+            )
+            (i, j, sign), times = max(pairs.items(), key=lambda item: (item[1], item[0]), default=((0, 0, 0), 0))
+            if times < 2:
+                return tuple(steps), tuple(tuple(mask.get(k, 0.0) for k in range(count)) for mask in masks)
+            for mask in masks:
+                if mask.get(i) and mask.get(j) == sign * mask[i]:
+                    mask[count] = mask.pop(i)
+                    del mask[j]
+            steps.append((i, j, sign))
+            count += 1
 
     @cached_property
     def masks_of_cube(self) -> tuple[tuple[float, ...], ...]:
@@ -458,7 +484,12 @@ class Sum:
     def _coefficients(self, blocks: Sequence[Block], turned: Turned) -> list[Value]:
         along = [self._along_cone(block, turned) for block in blocks]
         inputs = [along[block][at] for block, at in self.spline.inputs]
-        masks = [self._weighted(mask, inputs) for mask in self.spline.masks]
+        steps, shared = self.spline.shared
+        for first, second, sign in steps:
+            inputs.append(
+                (self.arithmetic.add if sign > 0 else self.arithmetic.subtract)(inputs[first], inputs[second])
+            )
+        masks = [self._weighted(mask, inputs) for mask in shared]
         return [self.by_shape(turned, [masks[r] for r in own]) for own in zip(*self.spline.rows, strict=True)]
 
     def _along_cone(self, block: Block, turned: Turned) -> Rows:
@@ -546,7 +577,14 @@ class Sum:
             if piece is not None:
                 for r, part in self._to_shapes(piece, own, turned):
                     self._add(masks, r, part)
-        return [self._weighted(column, masks) for column in zip(*self.spline.masks, strict=True)]
+        steps, shared = self.spline.shared
+        inputs = [self._weighted(column, masks) for column in zip(*shared, strict=True)]
+        for first, second, sign in reversed(steps):
+            own = inputs.pop()
+            if own is not None:
+                self._add(inputs, first, own)
+                self._add(inputs, second, own if sign > 0 else self.arithmetic.negate(own))
+        return inputs
 
     def _add(self, sums: list[Value], place: int, value: Value) -> None:
         sums[place] = value if sums[place] is None else self.arithmetic.add(sums[place], value)
