@@ -127,6 +127,24 @@ class Tetrahedra:
             found[tuple(weights.get(place, 0.0) for place in places)] = None
         return tuple(found)
 
+    @cached_property
+    def masks_of_octahedra(self) -> tuple[tuple[tuple[Steps, Steps, float], ...], ...]:
+        """The masks of all coefficients of octahedra in a cube about a sample at even indices, each once.
+
+        Returns:
+            for each its terms: twice the centre of a block, from the sample; its number, as in `inputs`; the weight.
+        """
+        found = {}
+        for mask, axes, side in product(self.masks, permutations(range(3)), (1, -1)):
+            terms = {}
+            for weight, (block, unit) in zip(mask, self.inputs, strict=True):
+                if weight:  # the cone looks from the centre, at side · ½, towards the sample
+                    x, y, z = (side - 2 * side * self.centres[block][axis] for axis in axes)
+                    i, j, k = (unit[axis] for axis in axes)
+                    terms[(x, y, z), (i, j, k)] = weight * (1 if unit == (0, 0, 0) else -side)
+            found[tuple((*key, weight) for key, weight in sorted(terms.items()))] = None
+        return tuple(found)
+
     @property
     def around(self) -> int:
         """Samples before and behind the one in the middle of a cube that its tetrahedra need, along any axis."""
@@ -299,6 +317,19 @@ class Turned:
     shapes: list[Value]
     barycentric: list[Value]
     nothing: Value
+
+
+def at_centre(arithmetic: Arithmetic, block: Block) -> Rows:
+    """Eight times the value and four times the gradient at the centre of 2³ samples."""
+    total, rows = None, {}
+    for axis, unit in enumerate(_UNITS):
+        ends: list[Value] = [None, None]
+        for at, sample in block.items():
+            own = ends[at[axis]]
+            ends[at[axis]] = sample if own is None else arithmetic.add(own, sample)
+        rows[unit] = arithmetic.subtract(ends[1], ends[0])
+        total = arithmetic.add(ends[0], ends[1]) if total is None else total
+    return {(0, 0, 0): total, **rows}
 
 
 class Sum:
@@ -494,20 +525,8 @@ class Sum:
 
     def _along_cone(self, block: Block, turned: Turned) -> Rows:
         if self.spline.size == 2:
-            return self._sorted(self._signed(self._at_centre(block), turned), turned)
+            return self._sorted(self._signed(at_centre(self.arithmetic, block), turned), turned)
         return self._sorted(self._mirrored(block, turned), turned)
-
-    def _at_centre(self, block: Block) -> Rows:
-        """Eight times the value and four times the gradient at the centre of 2³ samples."""
-        e = self.arithmetic
-        rows: Rows = {(0, 0, 0): None}
-        for axis, unit in enumerate(_UNITS):
-            ends: list[Value] = [None, None]
-            for at, sample in block.items():
-                self._add(ends, at[axis], sample)
-            rows[unit] = e.subtract(ends[1], ends[0])
-            rows[0, 0, 0] = e.add(ends[0], ends[1])
-        return rows
 
     def _from_centre(self, rows: Rows) -> Block:
         """The transpose."""

@@ -20,9 +20,9 @@ from llvmlite import ir
 from filterlab import bernstein
 from filterlab.ops.bounds import CODES
 from filterlab.ops.cpu import frame, job
-from filterlab.ops.cpu.lanes import DOUBLE, I16, I32, I64, STORAGE, Lanes, Value
+from filterlab.ops.cpu.lanes import DOUBLE, I1, I16, I32, I64, STORAGE, Lanes, Value
 from filterlab.ops.stencil import Lowered
-from filterlab.ops.tetrahedra import LoweredStencil, TetrahedralStencil
+from filterlab.ops.tetrahedra import LoweredStencil, Steps, TetrahedralStencil, at_centre
 
 # Arrays are contiguous; d is a double.
 FIELDS: dict[str, type] = {
@@ -65,8 +65,10 @@ class HullsVariant:
     def generate(self) -> str:
         """The program as LLVM IR text."""
         module, function = frame.new_module()
-        on_tetrahedra = isinstance(self.stencil, TetrahedralStencil)
-        (_OfCubes if on_tetrahedra else _OfCells)(self, function).write()
+        if not isinstance(self.stencil, TetrahedralStencil):
+            _OfCells(self, function).write()
+        else:
+            (_OfOctahedra if self.stencil.spline.octahedral else _OfCubes)(self, function).write()
         return str(module)
 
 
@@ -230,6 +232,65 @@ class _OfCubes(_Program):
         b, j = self.builder, self.job
         row = b.add(b.mul(b.add(z, I64(at[2])), j.height), b.add(y, I64(at[1])))
         return self._load(b.add(b.mul(row, j.width), b.add(x, I64(at[0]))))
+
+
+class _OfOctahedra(_Program):
+    """Of a spline on octahedra, two of which meet in a cube; along axes of odd indices cubes are turned round."""
+
+    def bound(self, z: Value, y: Value, x: Value) -> None:
+        stencil = self.variant.stencil
+        assert isinstance(stencil, TetrahedralStencil)
+        samples = _Samples(self, stencil.spline.around, (x, y, z))
+        for terms in stencil.spline.masks_of_octahedra:
+            total = None
+            for centre, unit, weight in terms:
+                number = samples.of_centre(centre, unit)
+                total = self.lanes.multiply_add(number, self.lanes.constant(weight), total)
+            self._bound([total])
+
+
+class _Samples:
+    """The samples around those of a pack, along axes that are turned round where their indices are odd.
+
+    Args:
+        around: samples before the one in the middle.
+        first: x, y, z of the pack's first cell.
+    """
+
+    def __init__(self, program: _Program, around: int, first: Sequence[Value]) -> None:
+        self.program, self.lanes, self.builder = program, program.lanes, program.builder
+        b, count = self.builder, self.lanes.count
+        self.x, *others = (b.add(own, I64(around)) for own in first)
+        odd = [b.trunc(own, I1) for own in first]
+        self.others = list(zip(others, odd[1:], strict=True))
+        every_second = ir.Constant(ir.VectorType(I1, count), [bool(lane % 2) for lane in range(count)])
+        self.odd = b.xor(every_second, self.lanes.everywhere(odd[0]))
+        self._known: dict[Steps, Value] = {}
+        self._blocks: dict[Steps, dict[Steps, Value]] = {}
+
+    def at(self, place: Steps) -> Value:
+        """So many steps from those in the middle."""
+        if place not in self._known:
+            e, b, j, i = self.lanes, self.builder, self.program.job, place[0]
+            y, z = (
+                b.add(own, b.select(odd, I64(-step), I64(step)))
+                for (own, odd), step in zip(self.others, place[1:], strict=True)
+            )
+            row = b.mul(b.add(b.mul(z, j.height), y), j.width)
+            ahead, behind = (self.program._load(b.add(row, b.add(self.x, I64(step)))) for step in (i, -i))
+            self._known[place] = e.where(self.odd, behind, ahead)
+        return self._known[place]
+
+    def of_centre(self, centre: Steps, unit: Steps) -> Value:
+        """Eight times the value or four times a derivative at a centre, given twice."""
+        if centre not in self._blocks:
+            x, y, z = centre
+            block = {
+                (i, j, k): self.at(((x - 1) // 2 + i, (y - 1) // 2 + j, (z - 1) // 2 + k))
+                for i, j, k in product(range(2), repeat=3)
+            }
+            self._blocks[centre] = at_centre(self.lanes, block)
+        return self._blocks[centre][unit]
 
 
 def _bernstein(monomial: Sequence[float], degree: int) -> list[float]:

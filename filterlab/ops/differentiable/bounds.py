@@ -10,7 +10,7 @@ from filterlab.ops import cpu
 from filterlab.ops.bounds import Bounds, Codes
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.gather import STORAGE
-from filterlab.ops.tetrahedra import AnyLattice, TetrahedralLattice
+from filterlab.ops.tetrahedra import AnyLattice
 
 _FEWEST = 1 << 16
 """Cells from which on a program is worth to be compiled: plain torch takes 20 to 500 ns for each."""
@@ -18,8 +18,6 @@ _FEWEST = 1 << 16
 
 def missing(lattice: AnyLattice) -> str | None:
     """What keeps the program from running here; None: nothing does."""
-    if isinstance(lattice, TetrahedralLattice) and lattice.spline.octahedral:
-        return "its cells are cubes; got octahedra"
     if problem := cpu.llvmlite_problem():
         return problem
     c = lattice.coefficients
