@@ -215,6 +215,6 @@ def test_labels_are_told_from_amounts() -> None:
         torch.from_numpy(RNG.integers(-1000, 3000, (12, 24, 24))).to(torch.int16),
         (255 * signals.marschner_lobb().sample(40).samples).to(torch.uint8),
         (25 * signals.torus().sample(96).samples).round().to(torch.int16),  # many equal neighbours, small steps
-        torch.arange(4 * 4 * 64, dtype=torch.int32).reshape(4, 4, 64) // 8,
+        sum(torch.meshgrid(*(torch.arange(48),) * 3, indexing="ij")) // 8,
     ]
     assert [look_like_labels(samples) for samples in amounts] == [False] * len(amounts)

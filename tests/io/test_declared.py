@@ -496,6 +496,11 @@ def test_samples_are_stored_in_the_type_that_is_asked_for(tmp_path: Path, ending
     for wrong in (-1, 0.5) if stored[0] == "u" else (0.5,) if stored == "int64" else ():
         with pytest.raises(VolumeFileError, match=f"samples that {stored} holds exactly; got {wrong}"):
             save_volume(Volume(torch.tensor([[[0.0, wrong]]])), path, stored=stored)
+    if stored[0] == "u":
+        with pytest.raises(VolumeFileError, match=f"samples that {stored} holds exactly; got -1"):
+            save_volume(Volume(torch.tensor([[[-1]]])), path, stored=stored)  # of int64
+    with pytest.raises(VolumeFileError, match=f"samples that float64 holds exactly; got {2**63 - 1}"):
+        save_volume(Volume(torch.tensor([[[2**60, 2**63 - 1]]])), path, stored="float64")
     with pytest.raises(VolumeFileError, match="samples that float32 holds exactly; got 16777217"):
-        save_volume(Volume(torch.tensor([[[16777217]]])), path, stored="float32")
+        save_volume(Volume(torch.tensor([[[16777216, 2**60, 16777217]]])), path, stored="float32")
     assert load_volume(path).samples.tolist() == [[[0, 1, top]]]
