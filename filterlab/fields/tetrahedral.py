@@ -428,8 +428,9 @@ class Folding:
                 high = 2 * math.ceil((n - 1 + coefficients.tail + reach) / 2)
             ends.append((low, high))
             index = torch.arange(low - spline.period - reach, high + spline.period + reach + 1)
-            if boundary.periodic:
-                index = boundary.source(index, n)
+            if boundary.periodic:  # what is stored is read as programs read it: it may be rounded otherwise
+                stored = (index >= coefficients.start) & (index < coefficients.start + size)
+                index = torch.where(stored, index, boundary.source(index, n))
             rows.append(stride * (index - coefficients.start).clamp(0, size - 1))
             zero.append(length + reach + spline.period - low)
             length += len(rows[-1])
@@ -502,7 +503,7 @@ class OnTetrahedra:
 
     @property
     def reach(self) -> int:
-        return _BEYOND + max(self.spline.lowered.reach) if self.name == "fused" else 1
+        return _BEYOND + max(self.spline.lowered.reach)
 
     @cached_property
     def stencils(self) -> tuple[TetrahedralStencil, ...]:
@@ -544,9 +545,12 @@ class FusedOnTetrahedra:
             return self.everywhere(points)
         rows, sign = self.near(points)
         if sign is not None:
-            (beyond,) = (sign == 0).any(-1).any(0).nonzero(as_tuple=True)
-            if len(beyond):
-                rows = rows.index_copy(-1, beyond, self.everywhere(points.index_select(1, beyond))[0])
+            beyond = (sign == 0).any(-1)  # (N, M)
+            (some,) = beyond.any(0).nonzero(as_tuple=True)
+            if len(some):
+                folded = self.everywhere(points.index_select(1, some))[0]
+                own = torch.where(beyond[:, None, None, some], folded, rows.index_select(-1, some))
+                rows = rows.index_copy(-1, some, own)
         return rows, None
 
 
