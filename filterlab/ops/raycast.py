@@ -139,11 +139,12 @@ def marks_of(parts: Tensor) -> Tensor:
     """`Raycast.marks` from (pz, py, px) which parts may hold the level."""
     whole = [n + n % 2 for n in parts.shape]
     pad = [k for n, own in zip(reversed(whole), reversed(parts.shape), strict=True) for k in (0, n - own)]
-    bits = torch.nn.functional.pad(parts.to(torch.uint8), pad)
+    bits = parts.view(torch.uint8) if parts.is_contiguous() else parts.to(torch.uint8)
+    bits = torch.nn.functional.pad(bits, pad) if any(pad) else bits
     for dim, shift in ((0, 4), (1, 2), (2, 1)):  # the last in memory when least is left
         first, second = bits.unflatten(dim, (-1, 2)).unbind(dim + 1)
         bits = first | (second << shift)
-    return torch.where(bits > 0, bits.to(torch.int16), -_clear_of(bits > 0).to(torch.int16))
+    return bits.to(torch.int16) - _clear_of(bits > 0)  # either is 0
 
 
 def _clear_of(relevant: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 Samples are read in blocks as they lie in memory, a line of a lane at a time, and are turned into the cone in registers:
 signs and exchanges of axes choose between two packs each. (Lanes that read their samples one by one, along axes turned
-already, took 3 to 5 times as long.) All arithmetic is that of `ops.tetrahedra.Sum`.
+already, took about twice as long.) All arithmetic is that of `ops.tetrahedra.Sum`.
 """
 
 from __future__ import annotations
