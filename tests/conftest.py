@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import gc
+import locale
 import os
 import shutil
 import tempfile
 import warnings
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -45,6 +47,14 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 @pytest.fixture(autouse=True)
 def _seeded() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _locale_kept() -> Iterator[None]:
+    """ITK, asked by a test itself, leaves the locale "C" behind: torch's compiler then can't read its own files."""
+    before = locale.setlocale(locale.LC_ALL)
+    yield
+    locale.setlocale(locale.LC_ALL, before)
 
 
 @pytest.fixture

@@ -96,7 +96,8 @@ def test_derivatives_at_points_of_any_bits(scheme: str, boundary: str, batch: li
     by_points, by_samples = torch.autograd.grad(value.sum(), (points, samples), retain_graph=True)
     assert bool(by_samples.isfinite().all())
     known = ~value.isnan()
-    torch.testing.assert_close(by_points[known], gradient[known], rtol=0, atol=3e-5)
+    near = known & ((points.detach().abs() < 2.0**60).all(-1) | (repetition(method) == 1))  # farther off all are even
+    torch.testing.assert_close(by_points[near], gradient[near], rtol=0, atol=3e-5)
     assert bool(by_points[points.isnan()].isnan().all())
     alone = torch.autograd.grad(field(points.detach()[known]).sum(), samples)[0]
     torch.testing.assert_close(by_samples, alone, rtol=0, atol=2e-5)

@@ -180,7 +180,7 @@ def _tiff() -> list[Original]:
         "BigTIFF": {"bigtiff": True},
         "TIFF deflate": {"compression": "zlib", "predictor": True},
         "TIFF tiled": {"tile": (16, 16), "compression": "zlib"},
-        "TIFF by OME": {"ome": True, "metadata": {"axes": "ZYX", "PhysicalSizeX": 0.5}},
+        "TIFF by OME": {"ome": True, "metadata": {"axes": "ZYX", **{f"PhysicalSize{axis}": 0.5 for axis in "XYZ"}}},
         "TIFF by ImageJ": {"imagej": True, "resolution": (2.0, 4.0), "metadata": {"spacing": 3.0, "axes": "ZYX"}},
     }
     return [

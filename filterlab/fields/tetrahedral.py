@@ -445,7 +445,8 @@ class Folding:
     def near(self, points: Tensor, geometry: Geometry) -> Tensor:
         """Voxel coordinates of world points (..., 3), moved by whole periods to where `lookup` knows their samples.
 
-        That is exact. Beyond the ends of border and zeros infinity is an even number, as all of the largest are.
+        That is exact. Beyond the ends of border and zeros infinity is an even number, as all of the largest are; beyond
+        2⁶⁰ voxels a coordinate has no derivative.
         """
         voxels = geometry.to_voxel(points)
         largest = torch.finfo(voxels.dtype).max

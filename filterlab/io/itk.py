@@ -11,7 +11,10 @@ from __future__ import annotations
 
 import importlib
 import itertools
+import locale
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +59,16 @@ def require_simpleitk(path: Path, what: str) -> Any:
     except ImportError:
         expected = f"SimpleITK, which reads {what} (pip install 'filterlab[itk]')"
         raise VolumeFileError(path, expected, "no such package") from None
+
+
+@contextmanager
+def _locale_kept() -> Iterator[None]:
+    """ITK reads some formats in the locale "C" and leaves it so: files would be opened as ASCII from then on."""
+    before = locale.setlocale(locale.LC_ALL)
+    try:
+        yield
+    finally:
+        locale.setlocale(locale.LC_ALL, before)
 
 
 def is_dicom(path: Path) -> bool:
@@ -131,7 +144,8 @@ def _information(path: Path, sitk: Any, name: str) -> Any:
     reader = sitk.ImageFileReader()
     reader.SetFileName(name)
     try:
-        reader.ReadImageInformation()
+        with _locale_kept():
+            reader.ReadImageInformation()
     except RuntimeError as error:
         raise VolumeFileError(path, f"{kind_of(path)} data that ITK reads", _reason(error)) from None
     return reader
@@ -144,7 +158,8 @@ def _read(path: Path, sitk: Any, names: list[str]) -> np.ndarray:
     else:
         reader.SetFileName(names[0])
     try:
-        return sitk.GetArrayFromImage(reader.Execute())
+        with _locale_kept():
+            return sitk.GetArrayFromImage(reader.Execute())
     except RuntimeError as error:
         raise VolumeFileError(path, "samples that ITK reads", _reason(error)) from None
 
@@ -200,7 +215,8 @@ def _affine(path: Path, sitk: Any, names: list[str], first: Any) -> np.ndarray:
 
 def _series(folder: Path, sitk: Any) -> list[str]:
     """The files of the one DICOM series in a folder, in their order in space."""
-    found = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
+    with _locale_kept():
+        found = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
     if len(found) != 1:
         raise VolumeFileError(folder, "a folder of one DICOM series", f"{len(found)} of them")
     names = list(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), found[0]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import locale
 import sys
 from pathlib import Path
 
@@ -54,6 +55,15 @@ def test_values_and_places_are_itk_s(tmp_path: Path, ending: str) -> None:
     assert volume.world.space == (LPS if anatomical else None)
     assert describe(path).affine.tolist() == volume.affine.tolist()
     assert path.resolve() in files_of(path)
+
+
+def test_the_locale_stays_as_it_is(tmp_path: Path) -> None:
+    """ITK reads VTK files in the locale "C"; left so, Python would open files as ASCII from then on."""
+    before = locale.setlocale(locale.LC_ALL)
+    sitk.WriteImage(image_of(SAMPLES), str(tmp_path / "a.vtk"))
+    locale.setlocale(locale.LC_ALL, before)
+    load_volume(tmp_path / "a.vtk")
+    assert locale.setlocale(locale.LC_ALL) == before
 
 
 @pytest.mark.parametrize(
