@@ -195,7 +195,7 @@ class TetrahedralStencil:
         """(stencil, raised): row raised[axis][r] of that one is the derivative along `axis` of row r of this one."""
         raised = TetrahedralStencil(self.spline, tuple(order + 1 for order in self.orders))
         numbers = {m: number for number, m in enumerate(raised.rows)}
-        return raised, tuple(tuple(numbers[raise_along(m, axis)] for m in self.rows) for axis in range(3))
+        return raised, tuple(tuple(numbers[_raise_along(m, axis)] for m in self.rows) for axis in range(3))
 
     def up_to(self, order: int) -> TetrahedralStencil:
         """The rows of orders up to this one."""
@@ -273,7 +273,7 @@ def _mirror(at: Steps, axis: int, last: int) -> Steps:
     return x, y, z
 
 
-def raise_along(m: MultiIndex, axis: int) -> MultiIndex:
+def _raise_along(m: MultiIndex, axis: int) -> MultiIndex:
     x, y, z = (order + (i == axis) for i, order in enumerate(m))
     return x, y, z
 
@@ -388,17 +388,19 @@ class Sum:
             mask = e.less(place[i], place[j])
             exchanged.append(mask)
             place[i], place[j] = e.where(mask, place[j], place[i]), e.where(mask, place[i], place[j])
-        every = [[self._affine(row, place) for row in shape] for shape in self.spline.barycentric]
-        shapes, barycentric = self._chosen(every)
+        shapes, barycentric = self._chosen(self._every_barycentric(place))
         return Turned(sides, exchanged, shapes, barycentric, nothing)
 
     def barycentric(self, turned: Turned, u: Sequence[Value]) -> list[Value]:
         """λ of other points, in the tetrahedra of those that were turned."""
         e = self.arithmetic
         signed = [e.where(negative, e.negate(x), x) for negative, x in zip(turned.negative, u, strict=True)]
-        place = self.along_cone(turned, signed)
-        every = [[self._affine(row, place) for row in shape] for shape in self.spline.barycentric]
+        every = self._every_barycentric(self.along_cone(turned, signed))
         return [self.by_shape(turned, own) for own in zip(*every, strict=True)]
+
+    def _every_barycentric(self, place: Sequence[Value]) -> list[list[Value]]:
+        """λ of places in the cone, in each of the shapes."""
+        return [[self._affine(row, place) for row in shape] for shape in self.spline.barycentric]
 
     def _affine(self, row: Sequence[float], place: Sequence[Value]) -> Value:
         e, total = self.arithmetic, None
@@ -520,7 +522,7 @@ class Sum:
             inputs.append(
                 (self.arithmetic.add if sign > 0 else self.arithmetic.subtract)(inputs[first], inputs[second])
             )
-        masks = [self._weighted(mask, inputs) for mask in shared]
+        masks = [self.weighted(mask, inputs) for mask in shared]
         return [self.by_shape(turned, [masks[r] for r in own]) for own in zip(*self.spline.rows, strict=True)]
 
     def _along_cone(self, block: Block, turned: Turned) -> Rows:
@@ -538,7 +540,7 @@ class Sum:
             block[at] = total
         return block
 
-    def _weighted(self, weights: Sequence[float], values: Sequence[Value]) -> Value:
+    def weighted(self, weights: Sequence[float], values: Sequence[Value]) -> Value:
         """Σ weight · value; None where there is no weight."""
         e, total = self.arithmetic, None
         for weight, value in zip(weights, values, strict=True):
@@ -555,7 +557,7 @@ class Sum:
     def _derivative(self, pieces: Sequence[Value], m: MultiIndex, turned: Turned) -> Value:
         if sum(m) == 0:
             return pieces[0]
-        every = [self._weighted(row, pieces) for row in self._derivatives(m)]
+        every = [self.weighted(row, pieces) for row in self._derivatives(m)]
         return self.by_shape(turned, [self.arithmetic.constant(0) if own is None else own for own in every])
 
     def _derivatives(self, m: MultiIndex) -> list[list[float]]:
@@ -597,7 +599,7 @@ class Sum:
                 for r, part in self._to_shapes(piece, own, turned):
                     self._add(masks, r, part)
         steps, shared = self.spline.shared
-        inputs = [self._weighted(column, masks) for column in zip(*shared, strict=True)]
+        inputs = [self.weighted(column, masks) for column in zip(*shared, strict=True)]
         for first, second, sign in reversed(steps):
             own = inputs.pop()
             if own is not None:

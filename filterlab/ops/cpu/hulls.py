@@ -224,8 +224,7 @@ class _OfCubes(_Program):
         for mask in stencil.spline.masks_of_cube:
             total = None
             for weight, sample in zip(mask, samples, strict=True):
-                if weight:
-                    total = self.lanes.multiply_add(sample, self.lanes.constant(weight), total)
+                total = self._added(total, weight, sample)
             self._bound([total])
 
     def _sample(self, z: Value, y: Value, x: Value, at: Sequence[int]) -> Value:
@@ -244,8 +243,7 @@ class _OfOctahedra(_Program):
         for terms in stencil.spline.masks_of_octahedra:
             total = None
             for centre, unit, weight in terms:
-                number = samples.of_centre(centre, unit)
-                total = self.lanes.multiply_add(number, self.lanes.constant(weight), total)
+                total = self._added(total, weight, samples.of_centre(centre, unit))
             self._bound([total])
 
 

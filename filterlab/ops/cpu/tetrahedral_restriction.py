@@ -96,15 +96,8 @@ class TetrahedralRestriction:
         e = self.lanes
         start, step = self._turned_round(own, own.start), self._turned_round(own, own.step)
         for kept, (normal, d) in zip(self._cuts, self.spline.cuts, strict=True):
-            place, speed = (self._dot(normal, x) for x in (start, step))
+            place, speed = (self.sum.weighted(normal, x) for x in (start, step))
             kept.value = e.divide(e.subtract(e.constant(d), place), speed)
-
-    def _dot(self, normal: Sequence[int], x: Sequence[Value]) -> Value:
-        e, total = self.lanes, None
-        for n, c in zip(normal, x, strict=True):
-            if n:
-                total = e.multiply_add(c, e.constant(n), total)
-        return total
 
     def _next(self, a: Value) -> Value:
         """The next τ where a plane is met, or 1."""

@@ -115,11 +115,12 @@ def ranges_of_cubes(samples: Tensor, spline: Tetrahedra) -> tuple[Tensor, Tensor
     Args:
         samples: (D, H, W), also those that the outermost cubes need; cubes are counted from an even index on.
     """
-    low, high = -_largest_of_windows(-samples, spline.size), _largest_of_windows(samples, spline.size)
+    low, high = -largest_of_windows(-samples, spline.size), largest_of_windows(samples, spline.size)
     return (-_largest_of_blocks(-low), _largest_of_blocks(high)) if spline.octahedral else (low, high)
 
 
-def _largest_of_windows(values: Tensor, size: int) -> Tensor:
+def largest_of_windows(values: Tensor, size: int) -> Tensor:
+    """The greatest of every window of size³; NaN where one is."""
     for dim in range(3):
         values = values.unfold(dim, size, 1).amax(-1)
     return values
