@@ -51,7 +51,7 @@ Key = TypeVar("Key", bound=Hashable)
 Jets = Mapping[tuple[tuple[int, int, int], int], Fraction]
 """A centre, and which of (f, ∂_x f, ∂_y f, ∂_z f) there -> its weight."""
 
-Rule = Mapping[tuple[int, tuple[int, int, int]], Fraction]
+Weights = Mapping[tuple[int, tuple[int, int, int]], Fraction]
 """One of `Tetrahedra.inputs` -> its weight."""
 
 
@@ -205,13 +205,13 @@ class Spline:
         )
 
     @property
-    def _rules(self) -> list[Mapping[Index, Rule]]:
+    def _rules(self) -> list[Mapping[Index, Weights]]:
         """For every shape its coefficients, of the numbers that `Tetrahedra.inputs` describes."""
         if self.jets is not None:
             return [{a: self._of_jets(jets) for a, jets in rules.items()} for rules in self.jets]
         return [{a: {(0, _place(o)): w for o, w in mask.items()} for a, mask in s.masks.items()} for s in self.shapes]
 
-    def _of_jets(self, jets: Jets) -> Rule:
+    def _of_jets(self, jets: Jets) -> Weights:
         numbers = {centre: number for number, centre in enumerate(self.centres)}
         parts = ((0, 0, 0), 8), ((1, 0, 0), 4), ((0, 1, 0), 4), ((0, 0, 1), 4)
         return {(numbers[c], parts[n][0]): weight / parts[n][1] for (c, n), weight in jets.items()}
@@ -514,19 +514,25 @@ class OnTetrahedra:
         )
 
     def evaluation(self, coefficients: Coefficients, placement: Placement, order: int) -> Evaluation:
-        everywhere = self.everywhere(coefficients, placement, order)
+        return self.evaluation_by(self.everywhere(coefficients, placement), coefficients, order)
+
+    def evaluation_by(
+        self, everywhere: JetOnTetrahedra, coefficients: Coefficients, order: int
+    ) -> JetOnTetrahedra | FusedOnTetrahedra:
+        """The same, of a jet of any order in plain torch: what it knows of samples under the boundary serves all."""
+        everywhere = replace(everywhere, order=order)
         if self.name == "direct":
             return everywhere
-        values, around = coefficients.values, replace(placement, boundary=Boundary.BORDER, tail=_BEYOND)
+        values, around = coefficients.values, replace(everywhere.placement, boundary=Boundary.BORDER, tail=_BEYOND)
         implementation = implementation_of(self.name, values.device)
         near = ops.Evaluation(values, around, self.stencils[order], coefficients.start, implementation)
         return FusedOnTetrahedra(near, everywhere)
 
-    def everywhere(self, coefficients: Coefficients, placement: Placement, order: int) -> JetOnTetrahedra:
-        """The jet in plain torch."""
+    def everywhere(self, coefficients: Coefficients, placement: Placement) -> JetOnTetrahedra:
+        """The jet of order 0 in plain torch."""
         tables = self.spline.tables.to(coefficients.values.device)
         folding = Folding.of(coefficients, self.spline)
-        return JetOnTetrahedra(self.spline, tables, folding, coefficients.values, placement, order)
+        return JetOnTetrahedra(self.spline, tables, folding, coefficients.values, placement, 0)
 
 
 @dataclass(frozen=True, eq=False)

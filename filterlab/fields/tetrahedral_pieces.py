@@ -22,9 +22,10 @@ from torch import Tensor
 
 from filterlab import bernstein
 from filterlab.fields.base import Field, Relevant, type_of_rays
-from filterlab.fields.grid import GridField
+from filterlab.fields.grid import Evaluation, GridField
 from filterlab.fields.tetrahedral import (
     TURNS,
+    FusedOnTetrahedra,
     JetOnTetrahedra,
     Located,
     Normal,
@@ -39,6 +40,7 @@ from filterlab.ops.differentiable import raycast as casting
 from filterlab.ops.pieces import Pieces
 from filterlab.ops.raycast import Candidates, Raycast
 from filterlab.ops.reference.pieces import CHUNK, Lines, inside, joined
+from filterlab.ops.reference.tetrahedra import largest_of_windows
 from filterlab.ops.tetrahedra import TetrahedralLattice
 
 _ROUNDING = 64  # units of rounding, relative to the largest value, by which bounds of a cell are widened
@@ -82,9 +84,13 @@ class FieldOnTetrahedra(GridField):
     def _settle(self) -> None:
         super()._settle()
         self._kept = None  # a copy has other coefficients
-        values = self.coefficients.values
-        own = replace(self.coefficients, values=values if self.channels is not None else values[None, None])
-        self.evaluated = self.scheme.everywhere(own, self.placement, 0)
+        first = self._own[0]
+        self.evaluated = first.everywhere if isinstance(first, FusedOnTetrahedra) else first  # type: ignore[assignment]
+
+    def _evaluations(self, values: Tensor) -> list[Evaluation]:
+        coefficients = replace(self.coefficients, values=values)
+        everywhere = self.scheme.everywhere(coefficients, self.placement)
+        return [self.scheme.evaluation_by(everywhere, coefficients, order) for order in range(self.max_order + 1)]
 
     @property
     def degree_along_rays(self) -> int | None:
@@ -116,8 +122,10 @@ class FieldOnTetrahedra(GridField):
     def _program(self, level: float, origins: Tensor, directions: Tensor) -> Raycast | None:
         """What a program casts; None where none can run, or plain torch is how this field is evaluated."""
         self._check_pieces()
-        if self.scheme.name == "direct":
-            return None
+        if self.scheme.name == "direct" or casting.missing_for(
+            self.lattice, type_of_rays(origins, directions), origins
+        ):
+            return None  # before bounds are made that nothing reads
         given = self._raycast(level, origins, directions)
         return given if casting.missing(given, origins) is None else None
 
@@ -227,7 +235,7 @@ class FieldOnTetrahedra(GridField):
         reach = [int(spline.shift + s * max(abs(c) for o in spline.samples for c in o)) for s in (-1, 1)]
         first, window = -spline.period, reach[1] - reach[0] + 1
         every = self.samples_between(first + reach[0], [n + spline.period + reach[1] for n in self.coefficients.size])
-        return -_pooled(-every, window), _pooled(every, window), first
+        return -largest_of_windows(-every, window), largest_of_windows(every, window), first
 
     def samples_between(self, first: int, last: list[int]) -> Tensor:
         """(D, H, W) float64, the samples from `first` to `last` along x, y, z, under the boundary."""
@@ -282,10 +290,3 @@ def _cut(line: Tensor, near: Tensor, far: Tensor, events: Tensor) -> tuple[Tenso
     some = b > a
     some[:, 0] |= far == near  # of a line that touches the domain
     return line[:, None].expand_as(a)[some], a[some], b[some]
-
-
-def _pooled(values: Tensor, window: int) -> Tensor:
-    """The greatest of every window³; NaN where one is."""
-    for dim in range(3):
-        values = values.unfold(dim, window, 1).amax(-1)
-    return values

@@ -9,23 +9,28 @@ from filterlab.ops import cpu, cuda
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.raycast import Candidates, Raycast
-from filterlab.ops.tetrahedra import TetrahedralLattice
+from filterlab.ops.tetrahedra import AnyLattice, TetrahedralLattice
 
 
 def missing(given: Raycast, origins: Tensor) -> str | None:
     """What keeps the program from running here as asked; None: nothing does."""
-    if transforming():
-        return "it has no transforms of torch.func"
-    points = torch.empty(1, 0, 3, dtype=given.dtype, device=origins.device)
-    on_a_gpu = _implementation_for(given) == "cuda"
-    if on_a_gpu and isinstance(given.lattice, TetrahedralLattice):
-        return "on a GPU it casts sums over taps"
-    room = cuda if on_a_gpu else cpu
-    if problem := room.missing(given.lattice.coefficients.detach()[None, None], points, given.lattice.stencil):
+    if problem := missing_for(given.lattice, given.dtype, origins):
         return problem
     if given.marks.numel() >= 1 << 31:
         return f"up to {1 << 31} bricks; got {given.marks.numel()}"
     return None
+
+
+def missing_for(lattice: AnyLattice, dtype: torch.dtype, origins: Tensor) -> str | None:
+    """The same, as far as bounds do not decide it."""
+    if transforming():
+        return "it has no transforms of torch.func"
+    points = torch.empty(1, 0, 3, dtype=dtype, device=origins.device)
+    on_a_gpu = _implementation_for(lattice) == "cuda"
+    if on_a_gpu and isinstance(lattice, TetrahedralLattice):
+        return "on a GPU it casts sums over taps"
+    room = cuda if on_a_gpu else cpu
+    return room.missing(lattice.coefficients.detach()[None, None], points, lattice.stencil)
 
 
 def first(given: Raycast, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Tensor:
@@ -45,10 +50,10 @@ def candidates(given: Raycast, origins: Tensor, directions: Tensor, implementati
 
 def _driver(given: Raycast, origins: Tensor, implementation: str | None):
     if implementation is None:
-        implementation = _implementation_for(given) if missing(given, origins) is None else "reference"
+        implementation = _implementation_for(given.lattice) if missing(given, origins) is None else "reference"
     return driver(implementation, "raycast")
 
 
-def _implementation_for(given: Raycast) -> str:
+def _implementation_for(lattice: AnyLattice) -> str:
     """What casts rays at these coefficients: "cpu" (vector code), or "cuda" (Triton) on a GPU."""
-    return "cuda" if given.lattice.coefficients.device.type == "cuda" else "cpu"
+    return "cuda" if lattice.coefficients.device.type == "cuda" else "cpu"
