@@ -103,10 +103,11 @@ def test_coefficients_are_converted_when_read(name, stored):
 @every_spline
 def test_points_that_are_nowhere_and_far_away(name):
     """NaN stays NaN, adds nothing, and no point reads beyond the array: what lies there would be seen."""
-    p = torch.tensor([[math.nan, 1, 1], [1, math.inf, 1], [1e30, -1e30, 0], [-40, 60, 3]], dtype=torch.float64)[None]
-    room = torch.full((15, 16, 17 + 64), math.nan, dtype=torch.float64)
-    room[:, :, 32:49] = padded()[0, 0]
-    inside = room[:, :, 32:49][None, None]
+    far = [1e30, -1e30, 0], [-40, 60, 3], [3, 2, -22], [3, 2, 25]
+    p = torch.tensor([[math.nan, 1, 1], [1, math.inf, 1], *far], dtype=torch.float64)[None]
+    room = torch.full((15 + 64, 16, 17), math.nan, dtype=torch.float64)
+    room[32:47] = padded()[0, 0]
+    inside = room[32:47][None, None]  # lies together: it is read in place
     for implementation in ("reference", "cpu"):
         for order in range(3):
             rows = ops.gather(inside, p, stencil_of(name, order), START, implementation)[0, 0]
