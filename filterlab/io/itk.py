@@ -217,9 +217,9 @@ def _series(folder: Path, sitk: Any) -> list[str]:
     """The files of the one DICOM series in a folder, in their order in space."""
     with _locale_kept():
         found = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
-    if len(found) != 1:
-        raise VolumeFileError(folder, "a folder of one DICOM series", f"{len(found)} of them")
-    names = list(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), found[0]))
+        if len(found) != 1:
+            raise VolumeFileError(folder, "a folder of one DICOM series", f"{len(found)} of them")
+        names = list(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), found[0]))
     if not 2 <= len(names) <= _MAX_SLICES:
         raise VolumeFileError(folder, f"a series of 2 to {_MAX_SLICES} slices", len(names))
     return names
