@@ -16,7 +16,10 @@ import pytest
 import torch
 
 from filterlab import METHODS, Volume, load_volume, resample, save_volume, signals
-from filterlab.cli import UsageError, main, split_overrides
+from filterlab.cli import main
+from filterlab.cli.outcome import UsageError
+from filterlab.cli.render import Render
+from filterlab.cli.scenes import split_overrides
 from filterlab.io import describe, load_image
 
 SCENE = """
@@ -99,7 +102,7 @@ def test_help_does_not_wait_for_torch() -> None:
 
 def test_split_overrides() -> None:
     line = "render s.yaml --size 512 512 -o a.png --method notch --camera.position -1 2.5 -.5 --lit --name=a b.yaml"
-    known, overrides = split_overrides(line.split())
+    known, overrides = split_overrides(Render, line.split())
     assert known == ["render", "s.yaml", "-o", "a.png", "b.yaml"]
     assert overrides == {
         "size": "[512, 512]",
@@ -108,10 +111,10 @@ def test_split_overrides() -> None:
         "lit": "true",
         "name": "a",
     }
-    assert split_overrides(["render", "--help"]) == (["render", "--help"], {})
-    assert split_overrides(["render", "s", "--output=a.png"]) == (["render", "s", "--output=a.png"], {})
+    assert split_overrides(Render, ["render", "--help"]) == (["render", "--help"], {})
+    assert split_overrides(Render, ["render", "s", "--output=a.png"]) == (["render", "s", "--output=a.png"], {})
     with pytest.raises(UsageError, match="--size again"):
-        split_overrides(["render", "--size", "1", "--size", "2"])
+        split_overrides(Render, ["render", "--size", "1", "--size", "2"])
 
 
 @pytest.mark.parametrize(
@@ -526,7 +529,7 @@ def test_an_allocation_that_fails_has_no_traceback(
 ) -> None:
     out = volume_file.with_name("out.nrrd")
     line = ["resample", volume_file, "-o", out, "--spacing", "1e-14", 1, 1, "--max-gigabytes", "1e9"]
-    monkeypatch.setattr("filterlab.cli._installed_memory", lambda: float("inf"))  # torch has to find out itself
+    monkeypatch.setattr("filterlab.cli.memory._installed_memory", lambda: float("inf"))  # torch has to find out itself
     fails(capsys, line, 1, "expected more memory than there is; torch could not get another", "bytes")
     line[5:8] = ["1e-17", 100, 100]
     fails(capsys, [*line[:-1], "1e12"], 1, "expected more memory than there is")

@@ -13,7 +13,9 @@ import yaml
 
 import filterlab as fl
 from filterlab import costs
-from filterlab.cli import MEMORY, TIME, UsageError, main, quantity
+from filterlab.cli import main
+from filterlab.cli.options import MEMORY, TIME, quantity
+from filterlab.cli.outcome import UsageError
 from filterlab.io.config import loads_config
 from filterlab.recommendation import ErrorEstimate, Recommendation, recommend, report, ways
 from filterlab.recommendation.choice import IMAGE, Question, _marched, choose

@@ -1,0 +1,159 @@
+"""The command `filterlab info`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from filterlab.cli.options import Channel, Frame
+from filterlab.cli.terminal import show, tell
+from filterlab.world import RAS, World
+
+if TYPE_CHECKING:
+    import torch
+
+    from filterlab.io.bounded import VolumeHeader
+
+BINS = 16
+
+
+@dataclass(frozen=True)
+class Info:
+    """Show what is in a volume file: its header, where it lies in the world, and how its values are distributed.
+
+    examples:
+      filterlab info engine.nrrd
+      filterlab info scan.nii.gz --header-only
+      filterlab info series.nii.gz --frame 3
+    """
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The volume: a file, or a folder of numbered TIFF slices."""
+    header_only: Annotated[bool, arg(aliases=["-H"])] = False
+    """Do not read the voxels."""
+    frame: Frame = None
+    """Which volume of a time series (or entry of a batch), from 0."""
+    channel: Channel = None
+    """Which of several values per voxel, from 0."""
+
+    def run(self, overrides: dict[str, str]) -> None:
+        from rich.table import Table
+        from rich.text import Text
+
+        from filterlab.io.volumes import describe, load_volume
+
+        header = describe(self.file, frame=self.frame, channel=self.channel)
+        table = Table(show_header=False, box=None)
+        for name, value in _described(header):
+            table.add_row(name, Text(value))
+        show(table)
+        if not self.header_only and _tell_open_choice(header):
+            table = Table(show_header=False, box=None)
+            volume = load_volume(self.file, frame=self.frame, channel=self.channel)
+            for name, value in _distribution(volume.samples):
+                table.add_row(name, Text(value))
+            show(table)
+
+
+def _described(header: VolumeHeader) -> list[tuple[str, str]]:
+    """Lines about a volume's header."""
+    import numpy as np
+
+    def numbers(values: Sequence[float]) -> str:
+        return " ".join(f"{v:.6g}" for v in values)
+
+    dtype = str(header.dtype).removeprefix("torch.")
+    extent = [n * s for n, s in zip(header.size, header.spacing, strict=True)]
+    lines = [
+        ("file", f"{header.path} ({header.format}, {header.encoding})"),
+        ("size (x, y, z)", " × ".join(map(str, header.size))),
+        ("type", header.stored if header.stored == dtype else f"{header.stored}, read as {dtype}"),
+        ("memory", f"{header.nbytes / 2**20:.4g} MiB"),
+        ("spacing", numbers(header.spacing)),
+        ("origin", numbers(header.origin)),
+        ("extent", numbers(extent)),
+        ("world axes", _axes(header.world)),
+        *([("unit", header.world.unit)] if header.world.unit else []),
+        *_forms(header.world),
+    ]
+    lines[2:2] = _choice(header)
+    if np.count_nonzero(header.affine[:3, :3] - np.diag(header.spacing)):
+        lines += [("affine" if i == 0 else "", numbers(row)) for i, row in enumerate(header.affine)]
+    return lines + list(header.fields.items())
+
+
+def _axes(world: World) -> str:
+    """What the axes of a world are, and what they are called in the file where that is something else."""
+    if world.axes is None:
+        return "not declared"
+    return world.axes if world.space in (world.axes, RAS) else f"{world.axes} (declared {world.space})"
+
+
+def _forms(world: World) -> list[tuple[str, str]]:
+    """What a NIfTI file says of its place."""
+    forms = world.nifti
+    if forms is None:
+        return []
+    elsewhere = "; they tell different places" if forms.to_qform else ""
+    time = "" if forms.time == "unknown" else f", time in {forms.time}"
+    return [("codes", f"NIfTI-{forms.version}, sform {forms.sform}, qform {forms.qform}{elsewhere}{time}")]
+
+
+def _choice(header: VolumeHeader) -> list[tuple[str, str]]:
+    """How many frames and channels there are, where there are several, and which one this is."""
+    choice, lines = header.choice, []
+    for name, count, index in (
+        ("frames", choice.frames, choice.frame),
+        ("channels", choice.channels, choice.channel),
+    ):
+        if count > 1:
+            lines.append((name, f"{count}" if index is None else f"{count}; this is {index}"))
+    return lines
+
+
+def _tell_open_choice(header: VolumeHeader) -> bool:
+    """Whether the voxels are those of one volume; if not, says on stderr what to choose."""
+    try:
+        header.check_choice()
+    except ValueError as error:
+        tell(f"no voxels are read: {error}")
+        return False
+    return True
+
+
+def _distribution(samples: torch.Tensor) -> list[tuple[str, str]]:
+    """Range, mean and a histogram of the finite values."""
+    import torch
+
+    values = samples.flatten()
+    lines = []
+    if values.dtype.is_floating_point:
+        finite = values[values.isfinite()]
+        lines += [("not finite", str(values.numel() - finite.numel()))] if finite.numel() < values.numel() else []
+        values = finite
+    if values.numel() == 0:
+        return [*lines, ("range", "no finite values")]
+    low, high = (float(v) for v in values.aminmax())
+    lines += [("range", f"{low:.6g} … {high:.6g}"), ("mean", f"{values.double().mean():.6g}")]
+    if high == low:
+        return lines
+    span = high - low
+    bins = min(BINS, int(span) + 1) if not values.dtype.is_floating_point else BINS
+    place = ((values.double() - low) * (bins / (span + (0 if values.dtype.is_floating_point else 1)))).long()
+    counts = torch.bincount(place.clamp_(0, bins - 1), minlength=bins)
+    return lines + _bars(counts.tolist(), low, span + (0 if values.dtype.is_floating_point else 1))
+
+
+def _bars(counts: list[int], low: float, span: float) -> list[tuple[str, str]]:
+    """One line per bin: where it begins, its share, and a bar on a logarithmic scale (1 voxel to all of them)."""
+    total, width = sum(counts), span / len(counts)
+    lines = []
+    for i, count in enumerate(counts):
+        bar = "█" * (1 + round(29 * math.log(count) / max(math.log(total), 1e-9))) if count else ""
+        lines.append((f"from {low + i * width:.6g}", f"{100 * count / total:6.2f} %  {bar}"))
+    return lines

@@ -1,0 +1,74 @@
+"""What several commands are asked in the same way, and the checks of it."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import arg
+
+from filterlab.cli.outcome import UsageError, first_line
+
+Triple = tuple[float, float, float]
+Output = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
+Frame = Annotated[int | None, arg(metavar="T")]
+Channel = Annotated[int | None, arg(metavar="C")]
+
+
+def check_asked(output: Path | None, explain: bool, ending: str) -> None:
+    """Raises UsageError unless a command makes something, or explains what it would make."""
+    if explain == (output is not None):
+        raise UsageError(f"expected either -o FILE{ending} or --explain; got " + ("both" if explain else "neither"))
+
+
+def check_not_input(output: Path, source: Path) -> None:
+    if os.path.realpath(output) == os.path.realpath(source):
+        raise ValueError(f"expected an output other than the input; got {output} for both")
+
+
+def check_name(what: str, name: str, known: object) -> None:
+    from filterlab.io.config import unknown_name
+
+    names = [str(k) for k in known]  # type: ignore[attr-defined]
+    if name not in names:
+        raise ValueError(unknown_name(what, name, names))
+
+
+def check_device(name: str) -> None:
+    import torch
+
+    try:  # rays are float64, and a value must come back (`meta` has none)
+        torch.ones(1, dtype=torch.float64, device=name).item()
+    except (RuntimeError, AssertionError, TypeError) as error:
+        raise ValueError(
+            f"device: expected a device that torch can use here, like cpu; got {name!r} ({first_line(error)})"
+        ) from None
+
+
+MEMORY = {"": 1.0, "B": 1.0} | {
+    f"{letter}{ending}": base**power
+    for power, letter in enumerate("KMGT", start=1)
+    for ending, base in (("B", 1000.0), ("iB", 1024.0))
+}
+
+
+TIME = {"": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+
+
+def quantity(option: str, text: str | None, units: dict[str, float]) -> float:
+    """A positive number with one of the units; infinite for None. Raises UsageError for anything else."""
+    if text is None:
+        return math.inf
+    match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*([A-Za-z%]*)\s*", text)
+    known = {unit.lower(): factor for unit, factor in units.items()}
+    try:
+        value = float(match[1]) * known[match[2].lower()] if match else math.nan
+    except (ValueError, KeyError):
+        value = math.nan
+    if not 0 < value < math.inf:
+        listed = ", ".join(unit for unit in units if unit)
+        raise UsageError(f"expected {option} to be a positive number, with or without a unit ({listed}); got {text!r}")
+    return value

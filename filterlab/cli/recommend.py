@@ -1,0 +1,130 @@
+"""The command `filterlab recommend`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from filterlab.cli.options import MEMORY, TIME, Channel, Frame, check_name, check_not_input, quantity
+from filterlab.cli.outcome import NOTHING_FITS, OK
+from filterlab.cli.terminal import progress_bar, show
+
+
+@dataclass(frozen=True)
+class Recommend:
+    """Find the cheapest method whose error on this volume stays within a budget.
+
+    Every method is built as it would be used and compared with the best estimate of the signal; costs are measured on
+    this machine. The exit code is 3 when nothing meets the budget (the best there is is shown, and written).
+
+    examples:
+      filterlab recommend engine.nrrd --max-error 0.5%
+      filterlab recommend scan.nii.gz --max-error 1% --task dvr --max-memory 256MiB -o scene.yaml
+      filterlab recommend scan.nii.gz --max-error 0.005 --json
+    """
+
+    volume: Annotated[Positional[Path], arg(metavar="VOLUME")]
+    """The volume: a file, or a folder of numbered TIFF slices."""
+    max_error: Annotated[str, arg(metavar="0.5%")]
+    """The error that is allowed, in parts of the range of the volume's values: 0.5% or 0.005."""
+    task: str = "resample"
+    """What is done with it: resample (values), dvr or isosurface (gradients count as well)."""
+    max_memory: Annotated[str | None, arg(metavar="256MiB")] = None
+    """What the coefficients may take, like 256MiB or 2GB."""
+    max_time: Annotated[str | None, arg(metavar="30s")] = None
+    """What prefiltering and doing the task once may take, like 500ms, 30s or 2min."""
+    boundary: str = "mirror"
+    """How the volume goes on beyond its ends: mirror, reflect, wrap, border or zeros."""
+    nan: str = "refuse"
+    """What becomes of voxels that are NaN: refuse, propagate or fill."""
+    frame: Frame = None
+    """Which volume of a time series (or entry of a batch), from 0."""
+    channel: Channel = None
+    """Which of several values per voxel, from 0."""
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="SCENE.yaml")] = None
+    """A scene to write, for `filterlab render`."""
+    json: bool = False
+    """Print the answer as JSON."""
+
+    def run(self, overrides: dict[str, str]) -> int:
+        from filterlab.io.atomic import check_writable
+
+        max_error = quantity("--max-error", self.max_error, {"%": 0.01, "": 1.0})
+        max_memory = quantity("--max-memory", self.max_memory, MEMORY)
+        max_time = quantity("--max-time", self.max_time, TIME)
+        if self.output is not None:
+            if self.output.suffix.lower() not in (".yaml", ".yml"):
+                raise ValueError(f"expected a scene's name that ends in .yaml; got {self.output}")
+            check_writable(self.output)
+            check_not_input(self.output, self.volume)
+
+        from filterlab.io.volumes import describe, load_volume
+        from filterlab.missing_values import CHOICES, resolved
+        from filterlab.recommendation import TASKS, recommend, report
+        from filterlab.volume import Boundary
+
+        for what, name, known in (
+            ("task", self.task, TASKS),
+            ("boundary", self.boundary, Boundary),
+            ("nan", self.nan, CHOICES),
+        ):
+            check_name(what, name, known)
+        part = {"frame": self.frame, "channel": self.channel}
+        if self.output is not None and len(shape := describe(self.volume, **part).shape) != 3:
+            raise ValueError(f"expected one volume (D, H, W) to write a scene of; {self.volume} has {tuple(shape)}")
+        volume = load_volume(self.volume, frame=self.frame, channel=self.channel)
+        file: str | dict[str, Any] = str(self.volume.resolve())
+        if chosen := {name: index for name, index in part.items() if index is not None}:
+            file = {"file": file, **chosen}
+        voxel = min(volume.spacing)
+        if self.output is not None:  # what would not render is refused before the work
+            samples, unknown = resolved(volume.samples, self.nan)
+            if unknown is not None:
+                raise ValueError("expected --nan fill to write a scene with; with propagate its picture has NaN in it")
+            low, high = samples.aminmax()
+            _check_scene(self.output, report.shown(file, (float(low), float(high)), voxel))
+        with progress_bar() as progress:
+            found = recommend(
+                volume,
+                max_error,
+                task=self.task,
+                max_memory=max_memory,
+                max_time=max_time,
+                boundary=self.boundary,
+                nan=self.nan,
+                progress=progress,
+            )
+        if self.json:
+            print(json.dumps(report.data(found), indent=2))
+        else:
+            show(report.text(found))
+        if self.output is not None:
+            _write_yaml(self.output, report.scene(found, file, voxel))
+        return OK if found.pick is not None else NOTHING_FITS
+
+
+def _check_scene(path: Path, content: dict[str, Any]) -> str:
+    """A scene as YAML. Raises ValueError for what `filterlab render` would refuse, or no file can hold."""
+    from filterlab.io.config import dump_data, loads_config
+    from filterlab.scenes.model import Scene
+
+    try:
+        str(content["volume"]).encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"expected a name in UTF-8 to write into a scene; got {content['volume']!r}") from None
+    text = dump_data(content)
+    loads_config(text, Scene, name=str(path))
+    return text
+
+
+def _write_yaml(path: Path, content: dict[str, Any]) -> None:
+    """A scene, checked, then written."""
+    from filterlab.io.atomic import atomic_write
+
+    text = _check_scene(path, content)
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,194 @@
+"""The command `filterlab resample`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from filterlab.cli.memory import as_float, check_memory, limit_in_bytes
+from filterlab.cli.options import Channel, Frame, Output, Triple, check_name, check_not_input
+from filterlab.cli.outcome import UsageError
+from filterlab.cli.saving import tell_rounding
+from filterlab.cli.terminal import tell
+
+if TYPE_CHECKING:
+    import torch
+
+    from filterlab.io.bounded import VolumeHeader
+    from filterlab.volume import Volume
+
+
+@dataclass(frozen=True)
+class Resample:
+    """Put a volume on another grid: finer, coarser, or that of another volume.
+
+    The volume is reconstructed by the chosen method and sampled anew; it stays where it is in the world. Making it
+    coarser does not blur first. Files: NRRD, NIfTI, TIFF stacks, .npy, .npz and .raw with a sidecar are read; .nrrd,
+    .nii, .nii.gz, .npy and .npz are written.
+
+    examples:
+      filterlab resample engine.nrrd -o fine.nrrd --method notch --spacing 0.5 0.5 0.5
+      filterlab resample engine.nrrd -o small.nii.gz --shape 128 128 64 --dtype input
+      filterlab resample pet.nii.gz -o pet_on_ct.nii.gz --like ct.nii.gz --fill 0
+      filterlab resample cells.ome.tif -o nuclei.nrrd --channel 1 --frame 0 --spacing 0.2 0.2 0.2
+      filterlab resample organs.nii.gz -o organs_on_ct.nii.gz --like ct.nii.gz --labels
+    """
+
+    input: Annotated[Positional[Path], arg(metavar="IN")]
+    """The volume: a file, or a folder of numbered TIFF slices."""
+    output: Output
+    """The volume to write."""
+    method: str = "triquadratic"
+    """How values between the voxels are found; `filterlab methods` lists the names."""
+    spacing: Annotated[Triple | None, arg(metavar="SX SY SZ")] = None
+    """New size of a voxel along x, y, z, in the volume's own units."""
+    shape: Annotated[tuple[int, int, int] | None, arg(metavar="NX NY NZ")] = None
+    """Instead of it: new number of voxels along x, y, z."""
+    like: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Instead of it: a volume file whose grid is taken over."""
+    boundary: str = "mirror"
+    """How the volume goes on beyond its ends: mirror, reflect, wrap, border or zeros."""
+    nan: str = "refuse"
+    """What becomes of voxels that are NaN: refuse, propagate (NaN near them) or fill (values from around)."""
+    frame: Frame = None
+    """Which volume of a time series (or entry of a batch), from 0."""
+    channel: Channel = None
+    """Which of several values per voxel, from 0: components of vectors, colours, dyes."""
+    fill: float | None = None
+    """The value of voxels outside of IN, for --like; `nan` too. Default: none, the boundary rules there."""
+    labels: bool = False
+    """The values of IN are names, not amounts: of each the method reconstructs where it is, and the strongest wins."""
+    dtype: str | None = None
+    """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN.
+    Default: `input` for labels and for the method nearest, else float32, or float64 if that is what the values need."""
+    nifti2: bool = False
+    """Write NIfTI-2, which fewer tools open; NIfTI-1 rounds numbers of the affine, by 6e-8 of themselves at most."""
+    max_gigabytes: float = 8.0
+    """The most memory that one volume may take: IN as it is read, or the result as it is computed or written."""
+
+    def run(self, overrides: dict[str, str]) -> None:
+        from filterlab.io.atomic import check_writable
+
+        asked = [self.spacing is not None, self.shape is not None, self.like is not None]
+        if sum(asked) != 1:
+            raise UsageError(
+                "expected one of --spacing, --shape and --like; got " + ("several" if any(asked) else "none")
+            )
+        check_writable(self.output)
+        for path in (self.input, self.like):
+            if path is not None:
+                check_not_input(self.output, path)
+
+        import numpy as np
+        import torch
+
+        from filterlab.io.volumes import check_saveable, describe, load_volume, save_volume
+        from filterlab.methods import METHODS
+        from filterlab.missing_values import CHOICES
+        from filterlab.resampling import resample
+        from filterlab.volume import Boundary, Volume
+
+        check_name("method", self.method, METHODS)
+        check_name("boundary", self.boundary, Boundary)
+        check_name("nan", self.nan, CHOICES)
+        source = describe(self.input, frame=self.frame, channel=self.channel)
+        source.check_choice()
+        target = None if self.like is None else describe(self.like)
+        keeps = self.labels or self.method == "nearest"
+        stored = _result_type(self.dtype or ("input" if keeps else None), source)
+        working = _working_type(stored, source)
+        check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)
+        self._check_fill(stored)
+        limit = limit_in_bytes(self.max_gigabytes)
+        shape = [*source.shape[:-3], *self._new_size(source, target)]
+        itemsize = max(working.itemsize, source.dtype.itemsize if keeps else 0, np.dtype(stored or "float32").itemsize)
+        check_memory(shape, itemsize, limit)
+        volume = load_volume(self.input, frame=self.frame, channel=self.channel, max_bytes=limit)
+        grid: dict = {"spacing": self.spacing} if self.spacing else {"shape": self.shape[::-1] if self.shape else None}
+        if target is not None:  # a grid without samples: one voxel, shown over and over
+            grid = {"like": Volume.with_geometry(torch.zeros(()).expand(target.shape[-3:]), target.geometry)}
+        if not keeps:
+            _tell_labels(volume, source, self.input)
+        asked = {"dtype": None if keeps or stored is None else working, "labels": self.labels, "fill": self.fill}
+        result = resample(volume, self.method, boundary=self.boundary, nan=self.nan, **asked, **grid)
+        save_volume(_converted(result, stored), self.output, stored=stored, nifti2=self.nifti2)
+        tell_rounding(result, self.output, self.nifti2)
+
+    def _check_fill(self, stored: str | None) -> None:
+        """Raises ValueError for a fill that no integer of the result is."""
+        import numpy as np
+
+        if self.fill is None or stored is None or stored.startswith("float"):
+            return
+        info = np.iinfo(stored)
+        if not (math.isfinite(self.fill) and self.fill == int(self.fill) and info.min <= self.fill <= info.max):
+            raise ValueError(f"expected a --fill that {stored} holds; got {self.fill:g}")
+
+    def _new_size(self, source: VolumeHeader, target: VolumeHeader | None) -> list[float]:
+        """Voxels along x, y, z of the result; checks what was asked."""
+        if target is not None:
+            return list(target.size)
+        if self.shape is not None:
+            if min(self.shape) < 1:
+                raise ValueError(f"expected --shape of 1 or more voxels along every axis; got {self.shape}")
+            return [as_float(n) for n in self.shape]
+        assert self.spacing is not None
+        if not all(math.isfinite(s) and s > 0 for s in self.spacing):
+            raise ValueError(f"expected a --spacing of positive numbers; got {self.spacing}")
+        return [max(1.0, n * s / t) for n, s, t in zip(source.size, source.spacing, self.spacing, strict=True)]
+
+
+INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
+
+
+def _result_type(name: str | None, source: VolumeHeader) -> str | None:
+    """The type in the file, by NumPy's name; None: what the values need."""
+    if name is None:
+        return None
+    check_name("dtype", name, ["float32", "float64", *INTEGERS, "input"])
+    if name != "input":
+        return name
+    if source.dtype.is_floating_point:
+        return str(source.dtype).removeprefix("torch.")
+    return source.stored if source.stored in INTEGERS else "uint8"  # bool
+
+
+def _working_type(stored: str | None, source: VolumeHeader) -> torch.dtype:
+    """What is computed in: float64 where that comes in or goes out, or wide integers do."""
+    import torch
+
+    wide = ("float64", "int32", "uint32", "int64", "uint64")
+    if source.dtype == torch.float64 or stored == "float64":
+        return torch.float64
+    return torch.float64 if source.stored in wide and stored != "float32" else torch.float32
+
+
+def _tell_labels(volume: Volume, source: VolumeHeader, path: Path) -> None:
+    """Warns of a volume whose values are likely to be names, between which nothing lies."""
+    from filterlab.labels import look_like_labels
+
+    if source.fields.get("intent") == "labels" or look_like_labels(volume.samples):
+        what = "its values look like labels, and are mixed like amounts; --labels or --method nearest keeps them"
+        tell(f"{path}: {what}")
+
+
+def _converted(volume: Volume, stored: str | None) -> Volume:
+    """The volume in a type that holds what is stored; integers are rounded, and clipped to what that holds."""
+    import numpy as np
+    import torch
+
+    from filterlab.io.bounded import SAMPLE_TYPES
+
+    if stored is None or not volume.dtype.is_floating_point:  # integers are written as they are, or refused
+        return volume
+    dtype = getattr(torch, SAMPLE_TYPES[stored])
+    if dtype.is_floating_point:
+        return volume.to(dtype)
+    least, most = int(np.iinfo(stored).min), min(int(np.iinfo(stored).max), torch.iinfo(dtype).max)
+    samples = volume.samples.round().clamp(least, most)
+    top = samples >= float(most)  # the largest int64 is no float: converting it would wrap round
+    return type(volume).with_geometry(samples.to(dtype).masked_fill(top, most), volume.geometry)

@@ -1,0 +1,63 @@
+"""The scene that `render` and `mesh` are asked for: a file, a volume and a level, and changes to its values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from filterlab.cli.options import check_device, check_not_input
+from filterlab.cli.outcome import UsageError
+
+if TYPE_CHECKING:
+    from filterlab.scenes.model import Scene
+
+
+def scene_asked_for(path: Path, overrides: dict[str, str], output: Path | None) -> Scene:
+    """The scene in a file; or, with a level among the overrides, that of the surface in a volume."""
+    from filterlab.scenes.build import load_scene, surface_scene
+
+    part = {name: overrides.pop(name) for name in ("frame", "channel") if name in overrides}
+    level = overrides.pop("level", None)
+    if level is None and path.suffix.lower() not in (".yaml", ".yml", "") and path.is_file():
+        raise ValueError(f"expected a scene, a .yaml file; for the surface in a volume add --level: {path}")
+    chosen = overrides | {f"volume.{name}": index for name, index in part.items()}
+    scene = load_scene(path, chosen) if level is None else surface_scene(path, level, chosen)
+    if scene.volume is not None and output is not None:
+        check_not_input(output, Path(scene.volume.file))
+    check_device(scene.device)
+    return scene
+
+
+def split_overrides(command: type, arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """What belongs to the command itself, and the changes to the scene: `--key value …` -> {key: YAML text}.
+
+    `--size 512 512` is {"size": "[512, 512]"}; `--key=value` and `--key value` are the same; a key alone is true.
+
+    Raises UsageError for a key that is given twice.
+    """
+    own = {f"--{f.name}": f.name == "explain" for f in fields(command) if f.name != "scene"}
+    known: list[str] = []
+    overrides: dict[str, str] = {}
+    rest = list(arguments)
+    while rest:
+        token = rest.pop(0)
+        name, given, _ = token.partition("=")
+        if token == "-o" or name in own:
+            known.append(token)
+            if not (given or own.get(name, False)):
+                known += rest[:1]
+                del rest[:1]
+        elif token.startswith("--") and len(token) > 2 and token != "--help":
+            key, equals, value = token[2:].partition("=")
+            values = [value] if equals else []
+            while not equals and rest and not re.match(r"-[-a-zA-Z]", rest[0]):
+                values.append(rest.pop(0))
+            if key in overrides:
+                raise UsageError(f"expected every field once; got --{key} again")
+            overrides[key] = "true" if not values else values[0] if len(values) == 1 else f"[{', '.join(values)}]"
+        else:
+            known.append(token)
+    return known, overrides
