@@ -30,7 +30,7 @@ from filterlab.io.bounded import (
     Stored,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     beside,
     check_geometry,
     check_size,
@@ -109,7 +109,7 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
         target,
         choice,
         0 if stored is None else stored.held(at),
-        lambda: as_tensor(path, itk.read_nrrd(path, size[::-1], dtype) if stored is None else stored.read(at), target),
+        lambda: as_samples(path, itk.read_nrrd(path, size[::-1], dtype) if stored is None else stored.read(at), target),
     )
 
 

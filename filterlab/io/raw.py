@@ -24,7 +24,7 @@ from filterlab.io.bounded import (
     Stored,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     beside,
     check_geometry,
     check_size,
@@ -92,5 +92,5 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
         target,
         Choice.of(path, 1, 1, frame, channel),
         0,
-        lambda: as_tensor(path, stored.read(), target),
+        lambda: as_samples(path, stored.read(), target),
     )

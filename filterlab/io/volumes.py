@@ -156,7 +156,9 @@ def load_volume(
         VolumeFileWarning: of what is odd and passed over, such as bytes behind the samples.
     """
     header = describe(path, frame=frame, channel=channel)
-    return Volume.with_geometry(header.read(max_bytes), header.geometry)
+    import torch
+
+    return Volume.with_geometry(torch.from_numpy(header.read(max_bytes)), header.geometry)
 
 
 def save_volume(
