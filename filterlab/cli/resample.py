@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from filterlab import names
 from filterlab.cli.memory import as_float, check_memory, limit_in_bytes
 from filterlab.cli.options import Channel, Frame, Output, Triple, check_name, check_not_input
 from filterlab.cli.outcome import UsageError
@@ -83,22 +84,24 @@ class Resample:
             if path is not None:
                 check_not_input(self.output, path)
 
+        check_name("method", self.method, names.methods())
+        check_name("boundary", self.boundary, names.BOUNDARIES)
+        check_name("nan", self.nan, names.NAN_CHOICES)
+
         import numpy as np
-        import torch
 
         from filterlab.io.volumes import check_saveable, describe, load_volume, save_volume
-        from filterlab.methods import METHODS
-        from filterlab.missing_values import CHOICES
-        from filterlab.resampling import resample
-        from filterlab.volume import Boundary, Volume
 
-        check_name("method", self.method, METHODS)
-        check_name("boundary", self.boundary, Boundary)
-        check_name("nan", self.nan, CHOICES)
         source = describe(self.input, frame=self.frame, channel=self.channel)
         source.check_choice()
         target = None if self.like is None else describe(self.like)
         keeps = self.labels or self.method == "nearest"
+
+        import torch
+
+        from filterlab.resampling import resample
+        from filterlab.volume import Volume
+
         stored = _result_type(self.dtype or ("input" if keeps else None), source)
         working = _working_type(stored, source)
         check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)

@@ -32,7 +32,8 @@ from filterlab.io.bounded import (
     sample_dtype,
     scaled,
 )
-from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, load_config, unknown_name
+from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, load_config
+from filterlab.names import unknown_name
 
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]

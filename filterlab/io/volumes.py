@@ -23,7 +23,8 @@ from torch import Tensor
 from filterlab.io import itk, nifti, nrrd, numpy_files, raw, tiff
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import VolumeFileError, VolumeHeader, beside, regular_file
-from filterlab.io.config import MAX_SIDECAR_BYTES, load_config, unknown_name
+from filterlab.io.config import MAX_SIDECAR_BYTES, load_config
+from filterlab.names import unknown_name
 from filterlab.volume import Volume, as_volume
 
 Writer = Callable[..., None]

@@ -22,11 +22,11 @@ from filterlab.fields.base import Domain
 from filterlab.fields.base import Field as FilterlabField
 from filterlab.fields.storage import StorageName
 from filterlab.io.bounded import VolumeFileError
-from filterlab.io.config import StrictModel, unknown_name
+from filterlab.io.config import StrictModel
 from filterlab.io.images import load_image
 from filterlab.io.volumes import VolumeHeader, describe, load_volume
 from filterlab.methods import METHODS, Method, reconstruct, scheme_named
-from filterlab.missing_values import NanChoice
+from filterlab.names import NanChoice, unknown_name
 from filterlab.render import materials
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
 from filterlab.render.rays import check_region

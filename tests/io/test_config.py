@@ -22,8 +22,8 @@ from filterlab.io.config import (
     key_path,
     load_config,
     loads_config,
-    unknown_name,
 )
+from filterlab.names import unknown_name
 
 
 class Side(StrEnum):
