@@ -20,7 +20,8 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 # each room may import the rooms before it (and itself); the same number: neither imports the other
 FLOORS = {
     "names": -2,
-    "world": -1,
+    "world": -2,
+    "geometry": -1,
     "forking": 0,
     "volume": 0,
     "kernels": 0,

@@ -21,12 +21,14 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
+from filterlab.geometry import Geometry
 from filterlab.io.warned import warn
-from filterlab.volume import Geometry, Volume
 from filterlab.world import UNDECLARED, World
 
 if TYPE_CHECKING:
     import torch
+
+    from filterlab.volume import Volume
 
 BLOCK = 2**20
 MAX_HEADER_BYTES = 2**20

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,8 +35,10 @@ from filterlab.io.bounded import (
     sample_dtype,
     storable,
 )
-from filterlab.volume import Volume
 from filterlab.world import RAS, NiftiForms, World
+
+if TYPE_CHECKING:
+    from filterlab.volume import Volume
 
 MAX_NIFTI1_AXIS = 32767
 HEADER_BYTES = {348: 352, 540: 544}  # sizeof_hdr -> bytes up to the first possible voxel

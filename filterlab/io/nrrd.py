@@ -19,7 +19,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -39,8 +39,10 @@ from filterlab.io.bounded import (
     sample_dtype,
     storable,
 )
-from filterlab.volume import Volume
 from filterlab.world import ANATOMICAL, SPACES, UNIT, World
+
+if TYPE_CHECKING:
+    from filterlab.volume import Volume
 
 _TYPES = {
     "int8": ("signed char", "int8", "int8_t"),

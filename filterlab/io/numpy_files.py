@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import numpy as np
 from pydantic import Field
@@ -45,7 +45,9 @@ from filterlab.io.bounded import (
     scaled,
 )
 from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, dump_config, load_config
-from filterlab.volume import Volume
+
+if TYPE_CHECKING:
+    from filterlab.volume import Volume
 
 Count = Annotated[int, Field(ge=1)]
 Row = tuple[float, float, float, float]

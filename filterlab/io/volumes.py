@@ -17,15 +17,18 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from filterlab.io import itk, nifti, nrrd, numpy_files, raw, tiff
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import VolumeFileError, VolumeHeader, beside, regular_file
 from filterlab.io.config import MAX_SIDECAR_BYTES, load_config
 from filterlab.names import unknown_name
-from filterlab.volume import Volume, as_volume
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from filterlab.volume import Volume
 
 Writer = Callable[..., None]
 
@@ -159,6 +162,8 @@ def load_volume(
     header = describe(path, frame=frame, channel=channel)
     import torch
 
+    from filterlab.volume import Volume
+
     return Volume.with_geometry(torch.from_numpy(header.read(max_bytes)), header.geometry)
 
 
@@ -187,6 +192,8 @@ def save_volume(
         ValueError, TypeError: a bare tensor that is no volume.
         OSError: the folder is missing or not writable.
     """
+    from filterlab.volume import as_volume
+
     volume = as_volume(volume)
     path = check_saveable(path, batched=volume.batched, nifti2=nifti2)
     known = format_of(path)
