@@ -167,7 +167,7 @@ class Volume:
 
     Raises:
         ValueError: wrong number of axes, an axis without voxels, non-positive spacing, singular affine.
-        TypeError: samples are no tensor, or complex, boolean or unsigned of more than 8 bits.
+        TypeError: samples are no tensor, or complex, boolean, floats of 8 bits or unsigned of more than 8 bits.
     """
 
     def __init__(
@@ -253,6 +253,8 @@ def _checked_samples(samples: Tensor) -> Tensor:
         raise TypeError(f"samples must be real numbers; got {samples.dtype}")
     if samples.dtype in (torch.uint16, torch.uint32, torch.uint64):
         raise TypeError(f"torch cannot index {samples.dtype}; convert: samples.to(torch.int32), int64 or float32")
+    if samples.dtype.is_floating_point and samples.dtype.itemsize == 1:
+        raise TypeError(f"torch cannot add up {samples.dtype}; convert: samples.to(torch.float16), bfloat16 or float32")
     return samples
 
 
