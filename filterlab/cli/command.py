@@ -21,6 +21,7 @@ from filterlab.cli.outcome import FAILED, INTERRUPTED, OK, USAGE, UsageError, me
 from filterlab.cli.recommend import Recommend
 from filterlab.cli.render import Render
 from filterlab.cli.resample import Resample
+from filterlab.cli.scene import Scene
 from filterlab.cli.scenes import split_overrides
 from filterlab.cli.sdf import Sdf
 from filterlab.cli.terminal import tell
@@ -33,13 +34,14 @@ filterlab COMMAND --help tells more, with examples. filterlab --version tells th
 COMMANDS: dict[str, Any] = {
     "render": Render,
     "mesh": Mesh,
+    "scene": Scene,
     "sdf": Sdf,
     "resample": Resample,
     "recommend": Recommend,
     "methods": Methods,
     "info": Info,
 }
-SHOWING: dict[str, Any] = {"render": Render, "mesh": Mesh}
+SHOWING: dict[str, Any] = {"render": Render, "mesh": Mesh, "scene": Scene}
 """Those that take a scene, and changes to it."""
 
 

@@ -38,7 +38,7 @@ def split_overrides(command: type, arguments: Sequence[str]) -> tuple[list[str],
 
     Raises UsageError for a key that is given twice.
     """
-    own = {f"--{f.name}": f.name == "explain" for f in fields(command) if f.name != "scene"}
+    own = {f"--{f.name}": f.default is False for f in fields(command) if f.name != "scene"}
     known: list[str] = []
     overrides: dict[str, str] = {}
     rest = list(arguments)

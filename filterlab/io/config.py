@@ -362,6 +362,8 @@ def _unfolded(model: type[BaseModel], path: KeyPath, value: Any) -> Any:
 def _override_value(text: str, place: str, key: str) -> Any:
     if len(text) > MAX_BYTES:
         raise ConfigError([Problem(place, key, f"expected at most {MAX_BYTES} characters; got more")])
+    if text.startswith("#"):  # a colour: as YAML it would be a comment, and no value at all
+        return text
     try:
         return _parse_value(text, place)[0]
     except ConfigError as error:
