@@ -87,6 +87,13 @@ class Geometry:
             world,
         )
 
+    def moved(self, affine: ArrayLike) -> Geometry:
+        """The same grid elsewhere: what was at the world point p is at affine · (p, 1).
+
+        Raises ValueError for a matrix that is not 4×4, finite, invertible, with the last row 0 0 0 1.
+        """
+        return Geometry.of(affine=Geometry.of(affine=affine).affine @ self.affine, world=self.world)
+
     @property
     def affine(self) -> np.ndarray:
         """The 4×4 map from voxel (x, y, z, 1) to world, float64."""

@@ -18,6 +18,7 @@ Triple = tuple[float, float, float]
 Output = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
 Frame = Annotated[int | None, arg(metavar="T")]
 Channel = Annotated[int | None, arg(metavar="C")]
+Quiet = Annotated[bool, arg(aliases=["-q"])]
 
 
 def check_asked(output: Path | None, explain: bool, ending: str) -> None:

@@ -8,9 +8,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from filterlab.cli.options import check_asked, check_not_input
+from filterlab.cli.loading import reading
+from filterlab.cli.options import Quiet, check_asked
+from filterlab.cli.saving import OutputFile
 from filterlab.cli.scenes import scene_asked_for
-from filterlab.cli.terminal import show
+from filterlab.cli.terminal import progress_bar, show
 
 
 @dataclass(frozen=True)
@@ -33,19 +35,20 @@ class Render:
     scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml | VOLUME")]
     """The scene, or a volume with --level."""
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
-    """The picture to write: a name that ends in .png."""
+    """The picture to write: a name that ends in .png; a file of that name is replaced."""
     explain: bool = False
     """Show what the picture would take, and what the scene leaves out; no picture is made."""
+    quiet: Quiet = False
+    """Say nothing of what was written, and show no progress."""
 
     def run(self, overrides: dict[str, str]) -> None:
         check_asked(self.output, self.explain, ".png")
-        if self.output is not None:
-            self._check_output(self.output)
+        output = None if self.output is None else self._output(self.output)
 
         from filterlab.scenes.build import build, render_scene
 
         scene = scene_asked_for(self.scene, overrides, self.output)
-        if self.output is None:
+        if output is None:
             from filterlab.scenes.plan import plan
             from filterlab.scenes.plan_report import table
 
@@ -53,12 +56,12 @@ class Render:
             return
         from filterlab.io.images import save_image
 
-        save_image(render_scene(scene, progress=None), self.output)
+        with progress_bar(self.quiet) as progress, reading(progress):
+            image = render_scene(scene, lambda done, total: progress(done / max(total, 1), "rendering"))
+        save_image(image, output.path)
+        output.tell(f"{image.shape[1]} × {image.shape[0]} pixels, 8-bit RGB")
 
-    def _check_output(self, output: Path) -> None:
-        from filterlab.io.atomic import check_writable
-
+    def _output(self, output: Path) -> OutputFile:
         if output.suffix.lower() != ".png":
             raise ValueError(f"expected a picture's name that ends in .png; got {output}")
-        check_writable(output)
-        check_not_input(output, self.scene)
+        return OutputFile.at(output, self.scene, quiet=self.quiet)

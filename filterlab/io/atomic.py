@@ -28,6 +28,10 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
         raise IsADirectoryError(f"cannot write {path}: expected a file name; got a folder")
     if not os.access(folder, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
         raise PermissionError(f"cannot write {path}: expected a writable folder; got {folder}, which is not")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise PermissionError(
+            f"cannot write {path}: expected a file that may be replaced; got one that is write-protected"
+        )
     return path
 
 

@@ -13,7 +13,7 @@ import math
 import os
 import re
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +23,7 @@ import numpy as np
 
 from filterlab.geometry import Geometry
 from filterlab.io.warned import warn
+from filterlab.io.watching import tell_done
 from filterlab.world import UNDECLARED, World
 
 if TYPE_CHECKING:
@@ -351,7 +352,7 @@ def read_array(
     first = int(np.ravel_multi_index(at[:leading], shape[:leading])) if leading else 0  # type: ignore[arg-type]
     parts, count = math.prod(shape[:leading]), math.prod(shape[leading:]) * dtype.itemsize
     skip_bytes(path, stream, first * count)
-    buffer = read_exactly(path, stream, count, allocate=raw)
+    buffer = read_exactly(path, stream, count, allocate=raw, progress=tell_done)
     skip_bytes(path, stream, (parts - 1 - first) * count)
     _tell_rest(path, stream, parts * count)
     array = native(buffer, dtype, shape[leading:])
@@ -400,7 +401,9 @@ def skip_bytes(path: Path, stream: BinaryIO, count: int) -> None:
         count -= len(block)
 
 
-def read_exactly(path: Path, stream: BinaryIO, count: int, *, allocate: bool) -> bytearray | np.ndarray:
+def read_exactly(
+    path: Path, stream: BinaryIO, count: int, *, allocate: bool, progress: Callable[[float], None] = lambda part: None
+) -> bytearray | np.ndarray:
     """The next `count` bytes. Raises VolumeFileError if there are fewer.
 
     A length that was compared with the file's is allocated at once (`allocate`); else memory grows with what is really
@@ -411,11 +414,13 @@ def read_exactly(path: Path, stream: BinaryIO, count: int, *, allocate: bool) ->
         done = 0
         while done < count and (n := stream.readinto(memoryview(whole)[done : done + 64 * BLOCK])):  # type: ignore[attr-defined]
             done += n
+            progress(done / count)
         buffer = whole
     else:
         buffer = bytearray()
         while len(buffer) < count and (block := stream.read(min(BLOCK, count - len(buffer)))):
             buffer += block
+            progress(len(buffer) / count)
         done = len(buffer)
     if done < count:
         raise VolumeFileError(path, f"{count} bytes of samples", f"the end of the data after {done}")
@@ -441,7 +446,39 @@ def as_samples(path: Path, array: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return array if array.flags.writeable else array.copy()
 
 
-def storable(path: Path, volume: Volume, types: Sequence[str], stored: str | None = None) -> np.ndarray:
+@dataclass(frozen=True)
+class Outgoing:
+    """Samples on their way into a file: held as they are, and turned block by block into the type that it has.
+
+    `array` is contiguous, `dtype` holds all of its numbers.
+    """
+
+    array: np.ndarray
+    dtype: np.dtype
+
+    @classmethod
+    def of(cls, path: Path, array: np.ndarray, name: str | None) -> Outgoing:
+        """In the type of that name (None: their own). Raises VolumeFileError where it does not hold all samples."""
+        outgoing = cls(array, array.dtype if name is None else np.dtype(name))
+        if outgoing.dtype != array.dtype:
+            for block in outgoing._blocks():
+                check_exact(path, block, outgoing.dtype)
+        return outgoing
+
+    def blocks(self) -> Iterator[np.ndarray]:
+        """The samples in their order and the type of the file, about a megabyte at a time; tells how far it is."""
+        done = 0
+        for block in self._blocks():
+            yield block.astype(self.dtype, copy=False)
+            done += block.size
+            tell_done(done / self.array.size)
+
+    def _blocks(self) -> Iterator[np.ndarray]:
+        flat, step = self.array.reshape(-1), BLOCK // self.array.itemsize
+        yield from (flat[first : first + step] for first in range(0, flat.size, step))
+
+
+def storable(path: Path, volume: Volume, types: Sequence[str], stored: str | None = None) -> Outgoing:
     """The (D, H, W) samples of a volume in one of the types; float16 and bfloat16 widen to float32 where they must.
 
     Args:
@@ -456,14 +493,11 @@ def storable(path: Path, volume: Volume, types: Sequence[str], stored: str | Non
     if samples.ndim != 3 or name not in types:
         got = f"{volume}" if stored is None else f"{stored} for {volume}"
         raise VolumeFileError(path, f"samples (D, H, W) of a type among {', '.join(types)}", got)
-    return exactly(path, samples.contiguous().numpy(), name)
+    return Outgoing.of(path, samples.contiguous().numpy(), name)
 
 
-def exactly(path: Path, array: np.ndarray, name: str | None) -> np.ndarray:
-    """The same numbers in another type (None: their own). Raises VolumeFileError where it does not hold them all."""
-    if name is None or array.dtype.name == name:
-        return array
-    dtype = np.dtype(name)
+def check_exact(path: Path, array: np.ndarray, dtype: np.dtype) -> None:
+    """Raises VolumeFileError where another type does not hold all of these numbers."""
     with np.errstate(invalid="ignore", over="ignore"):
         converted = array.astype(dtype)
         back = converted.astype(array.dtype)
@@ -473,8 +507,7 @@ def exactly(path: Path, array: np.ndarray, name: str | None) -> np.ndarray:
     elif array.dtype.kind in "iu":
         kept &= converted < 2.0**63  # which comes back as something else, or as the largest int64
     if not kept.all():
-        raise VolumeFileError(path, f"samples that {name} holds exactly", f"{array[~kept].flat[0]}")
-    return converted
+        raise VolumeFileError(path, f"samples that {dtype.name} holds exactly", f"{array[~kept].flat[0]}")
 
 
 def rescaled(array: np.ndarray, slope: float, intercept: float, dtype: np.dtype) -> np.ndarray:

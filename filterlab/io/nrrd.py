@@ -352,7 +352,7 @@ def _per_axis(
 
 def write(volume: Volume, path: Path, stored: str | None = None) -> None:
     """Writes one attached NRRD file, gzip. float16 and bfloat16, which the format lacks, become float32."""
-    array = storable(path, volume, tuple(_WRITTEN), stored)
+    samples = storable(path, volume, tuple(_WRITTEN), stored)
     affine, world = volume.affine, volume.world
     if world.space in ANATOMICAL:
         affine = np.diag([*ANATOMICAL[world.space], 1.0]) @ affine + 0.0
@@ -360,7 +360,7 @@ def write(volume: Volume, path: Path, stored: str | None = None) -> None:
     lines = [
         "NRRD0005",
         "# https://teem.sourceforge.net/nrrd/format.html",
-        f"type: {_WRITTEN[array.dtype.name]}",
+        f"type: {_WRITTEN[samples.dtype.name]}",
         "dimension: 3",
         f"space: {world.space}" if world.space else "space dimension: 3",
         f"sizes: {' '.join(map(str, volume.size))}",
@@ -374,5 +374,5 @@ def write(volume: Volume, path: Path, stored: str | None = None) -> None:
     with path.open("wb") as file:
         file.write(("\n".join(lines) + "\n\n").encode("ascii"))
         with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:
-            for plane in array:
-                stream.write(plane.data)
+            for block in samples.blocks():
+                stream.write(block.data)

@@ -28,6 +28,7 @@ from filterlab.io.bounded import (
 )
 from filterlab.io.tiff_layouts import MAX_OME, FirstPage, Layout
 from filterlab.io.tiff_pages import DESCRIPTION, Page, TiffFile
+from filterlab.io.watching import tell_done
 from filterlab.world import World
 
 SUFFIXES = (".tif", ".tiff")
@@ -122,9 +123,10 @@ def _read(
     files: list[Path], shape: tuple[int, ...], target: np.dtype, wanted: Mapping[int, int], sample: int
 ) -> np.ndarray:
     """The slices that are wanted, page -> slice, each of one of the values of its pixels."""
-    samples = np.empty(shape, target)
+    samples, last = np.empty(shape, target), max(wanted)
     pages = (page for file in files for page in _pages(file))
     for index, page in enumerate(pages):
         if index in wanted:
             samples[wanted[index]] = as_samples(page.directory.file.path, page.read(sample), target)
+            tell_done((index + 1) / (last + 1))
     return samples

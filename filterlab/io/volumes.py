@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 Writer = Callable[..., None]
 
+MAX_BYTES = 2**33  # that samples may take in memory, where nobody says otherwise
+
 
 @dataclass(frozen=True)
 class VolumeFormat:
@@ -138,7 +140,7 @@ def describe(path: str | os.PathLike[str], *, frame: int | None = None, channel:
 
 
 def load_volume(
-    path: str | os.PathLike[str], *, frame: int | None = None, channel: int | None = None, max_bytes: int = 2**33
+    path: str | os.PathLike[str], *, frame: int | None = None, channel: int | None = None, max_bytes: int = MAX_BYTES
 ) -> Volume:
     """The volume in a file (or in a folder of TIFF slices).
 
