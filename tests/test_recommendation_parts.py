@@ -217,3 +217,37 @@ def test_what_samples_were_rounded_by_is_in_the_upper_end(dtype, offset) -> None
     assert surely.estimate("resample", MethodErrors(Distance(found.rounding), none.gradient)).low == 0
     for whole in (torch.uint8, torch.int16):
         assert Yardstick.of(torch.arange(64, dtype=whole).reshape(1, 4, 4, 4), None, Boundary.MIRROR).rounding == 0
+
+
+@pytest.mark.parametrize("task", ["resample", "isosurface", "dvr"])
+@pytest.mark.parametrize("fall", [0.0, 10.0])
+def test_what_a_task_counts(task, fall) -> None:
+    """The value; of others the value or the gradient, whichever is further off; of a march s² |f''| / 24 beside."""
+    doubts = {"value": 0.02, "gradient": 0.03, "bend": 0.05}
+    yardstick = Yardstick(Boundary.MIRROR, (0.0, 1.0), (), (), doubts, 0.0, 0.4, fall)
+    step = 0.7 if task == "dvr" else None
+    lost = 0.0 if step is None else 0.49 / 24
+    for value, gradient in ((0.2, 0.5), (0.5, 0.2)):
+        errors = MethodErrors(Distance(value), Distance(gradient))
+        counted = {"value": value} if task == "resample" else {"value": value, "gradient": gradient}
+        ends = [
+            (max(d - factors(name, fall)[0] * doubts[name], 0), math.hypot(d, factors(name, fall)[1] * doubts[name]))
+            for name, d in (counted | {"bend": 0.4}).items()
+        ]
+        (*lows, low), (*highs, high) = zip(*ends, strict=True)
+        found = yardstick.estimate(task, errors, step)
+        assert found.measured == pytest.approx(math.hypot(max(counted.values()), lost * 0.4))
+        assert found.doubt == pytest.approx(math.hypot(max(doubts[name] for name in counted), lost * 0.05))
+        assert found.low == pytest.approx(math.hypot(max(lows), lost * low))
+        assert found.high == pytest.approx(math.hypot(max(highs), lost * high))
+
+
+def test_a_sample_stands_for_its_step_but_for_a_24th_of_the_second_derivative() -> None:
+    """Of a wave along a ray: the mean over a step less what stands in its middle."""
+    x, omega, step = torch.linspace(0, 40 * math.pi, 4001, dtype=torch.float64), 0.3, 0.8
+    within = (torch.arange(100, dtype=torch.float64) + 0.5) / 100 - 0.5
+    lost = torch.cos(omega * (x[:, None] + step * within)).mean(1) - torch.cos(omega * x)
+    bend = float((omega**2 * torch.cos(omega * x)).square().mean().sqrt())
+    yardstick = Yardstick(Boundary.MIRROR, (0.0, 1.0), (), (), dict.fromkeys(CALIBRATION, 0.0), 0.0, bend, 20.0)
+    none = MethodErrors(Distance(0.0), Distance(0.0))
+    assert float(lost.square().mean().sqrt()) == pytest.approx(yardstick.estimate("dvr", none, step).measured, rel=0.01)
