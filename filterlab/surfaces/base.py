@@ -10,7 +10,7 @@ which is evaluated once more, at a hit with derivatives, where derivatives of it
 any order, and t keeps its bits. Backward passes keep the rays and t; they cost a gather, a pull and a splat. Of
 surfaces that cannot tell their numbers two steps of Newton's method are recorded instead, t ← t − F(o + t d) / s, each
 right to one more order. s is the derivative of F along the ray itself, whatever a field gives as its gradient. Where it
-is 0, at tangents, a hit has no derivative, and gets 0.
+is 0, at tangents, a hit has no derivative, and gets 0. The same where it is not known: at hits beside what is missing.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from filterlab.ops.differentiable.recording import transforming
 MAX_SHEETS = 4096
 _STEPS = 2  # of Newton's method: derivatives up to the second
 _FAR = 64  # diameters of the domain from which on o + t d is polished
+_BESIDE = 1e-3  # voxels from a hit, along its ray, to where derivatives are looked for that are none at it
 _POLISH = 1e-3  # of a voxel, by at most: rays that are nearly tangents turn the rounding of o + t d into long ways
 
 
@@ -55,7 +56,7 @@ class SurfacePoints(NamedTuple):
 
     Attributes:
         point: (..., 3), in the world.
-        gradient: ∇F (..., 3) per world unit, as the field gives it; None for order 0.
+        gradient: ∇F (..., 3) per world unit, as the field gives it, and 0 where that is NaN; None for order 0.
         normal: ∇F / |∇F| (..., 3), towards greater values; 0 where the gradient is.
         curvatures: κ₁ ≥ κ₂ (..., 2) per world unit: along a principal direction v the normal n turns by ∂n/∂v = κ v, so
             that a ball of greater values than around it has −1/r twice; None below order 2.
@@ -177,8 +178,23 @@ class Surface(ABC):
         index = _where(hit.valid)
         o, d, t = _chosen(index, shape, origins, directions, hit.t[..., None])
         point = self._polished(o, d, t[:, 0])
-        rows = _geometry(point, self.jet(point, order)[1:]) if order else SurfacePoints(point)
+        rows = _geometry(point, self._derivatives(point, d, order)) if order else SurfacePoints(point)
         return SurfacePoints(*_spread([row for row in rows if row is not None], index, shape))
+
+    def _derivatives(self, points: Tensor, directions: Tensor, order: int) -> tuple[Tensor, ...]:
+        """Gradient, and Hessian, at hits (M, 3); where they are NaN, beside what is missing, just before or behind."""
+        rows = self.jet(points, order)[1:]
+        unknown = _unknown(rows)
+        if not bool(unknown.any()):
+            return rows
+        apart = directions.detach() * (_BESIDE * self.domain.voxel_size / directions.detach().norm(dim=-1))[:, None]
+        for step in (-apart, apart):
+            points = torch.where(unknown[:, None], points + step, points)
+            unknown = _unknown(self.detached.jet(points.detach(), order)[1:])
+            points = torch.where(unknown[:, None], points - step, points)
+        known = _where(~unknown)  # 0 · NaN is NaN: the others must not be in the graph
+        rows = self.jet(points.index_select(0, known), order)[1:]
+        return tuple(row.new_zeros(len(points), *row.shape[1:]).index_copy(0, known, row) for row in rows)
 
     def _searched(self, origins: Tensor, directions: Tensor) -> Tensor:
         """t (...) of first hits in the type of the rays, without derivatives."""
@@ -220,7 +236,7 @@ class Surface(ABC):
         slope = self._slope(_along(origins, directions, t), directions)
         for _ in range(_STEPS):
             value = self._value(_along(origins, directions, t))
-            t = t - (value - value.detach()) / slope
+            t = t - torch.where(value.isnan(), 0, value - value.detach()) / slope
         return t
 
     def _polished(self, origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
@@ -268,6 +284,7 @@ class _Attached(torch.autograd.Function):
             tensors = [x.detach().requires_grad_(need) for x, need in zip(tensors, needed, strict=True)]
             points = _along(origins, directions, t)
             value, gradient = ctx.surface._differentiated(points, tensors)
+        gradient = torch.where(gradient.isnan(), 0, gradient)
         weight = -cotangents[0] / _along_rays(gradient, directions)
         by_rays = weight[:, None] * gradient, (weight * t)[:, None] * gradient
         return None, None, *by_rays, *_by_tensors(value, tensors, needed, weight)
@@ -284,9 +301,9 @@ def _by_tensors(value: Tensor, tensors: Sequence[Tensor], needed: Sequence[bool]
 
 
 def _along_rays(gradient: Tensor, directions: Tensor) -> Tensor:
-    """s = g·d (M,); 1 / s is 0 where it is 0: ∞ stands there."""
+    """s = g·d (M,); 1 / s is 0 where it is 0, or NaN: ∞ stands there."""
     slope = (gradient * directions).sum(-1)
-    return torch.where(slope == 0, torch.inf, slope)
+    return torch.where(slope.abs() > 0, slope, torch.inf)
 
 
 def check_sheets(sheets: int) -> None:
@@ -345,6 +362,11 @@ def _where(mask: Tensor) -> Tensor:
     """Places of what is true in the flat mask; numpy finds them in a tenth of torch's time."""
     flat = mask.flatten()
     return torch.from_numpy(np.flatnonzero(flat.numpy())) if flat.device.type == "cpu" else flat.nonzero()[:, 0]
+
+
+def _unknown(rows: Sequence[Tensor]) -> Tensor:
+    """(M,) whether any number of rows (M, …) is NaN."""
+    return torch.stack([row.detach().flatten(1).isnan().any(1) for row in rows]).any(0)
 
 
 def _chosen(index: Tensor, shape: torch.Size, *rows: Tensor) -> list[Tensor]:

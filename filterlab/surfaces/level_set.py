@@ -13,7 +13,7 @@ others the root search of `filterlab.roots` cannot miss one. Nothing is stepped,
 | the field jumps over the level from one piece to the next | one hit, at the knot |
 | a ray begins inside, or on the surface | as any other: a surface has no inside; t = 0 where f(o) = level |
 | the surface leaves the domain | it ends there, open |
-| coefficients that are not finite | no hit in cells that read them: a hole |
+| coefficients that are not finite | no hit in cells that read them: the surface ends there, open |
 | a level that no value has | no hit |
 """
 

@@ -72,8 +72,8 @@ def arrays_of(variant: RayVariant) -> tuple[str, ...]:
 class Program:
     """Writes a program. What is done at its begin, with a segment and at its end are lines of the march or its adjoint.
 
-    Those find `near`, the rays that have a segment here which is not known to be empty; `row_0` …; `thickness`, the
-    segment's length in units of the opacity; and keep `passed`, the optical depth behind it.
+    Those find `near`, the rays that have a segment here which is not known to be empty, and no NaN; `row_0` …;
+    `thickness`, the segment's length in units of the opacity; and keep `passed`, the optical depth behind it.
     """
 
     def __init__(self, name: str, variant: RayVariant) -> None:
@@ -106,6 +106,8 @@ class Program:
             with self.if_any("near"):
                 self.taps.weigh()
                 self.taps.contract("first")
+                for r in range(len(self.taps.stencil.rows)):
+                    self.line(f"near = near & (row_{r} == row_{r})  # nothing is at a NaN")
                 self.sample()
             self.line("i += leap" if self.skipping else "i += 1")
             self.line("goes = inside & (i < count) & ((passed <= opaque) | (passed != passed))  # NaN goes on")
