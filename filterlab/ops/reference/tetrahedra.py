@@ -35,6 +35,9 @@ class Tensors:
     def multiply_add(self, a: Tensor, b: Tensor, c: Tensor | None) -> Tensor:
         return a * b if c is None else torch.addcmul(c, a, b)
 
+    def divide(self, a: Tensor, b: Tensor) -> Tensor:
+        return a / b
+
     def negate(self, a: Tensor) -> Tensor:
         return -a
 
@@ -46,6 +49,9 @@ class Tensors:
 
     def less(self, a: Tensor, b: Tensor) -> Tensor:
         return a < b
+
+    def both(self, a: Tensor, b: Tensor) -> Tensor:
+        return a & b
 
     def where(self, mask: Tensor, a: Tensor, b: Tensor) -> Tensor:
         return torch.where(mask, a, b)
