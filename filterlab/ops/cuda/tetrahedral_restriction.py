@@ -1,6 +1,16 @@
 """Splines on tetrahedra along rays in Triton: `ops.cpu.tetrahedral_restriction` says what is computed.
 
-Each thread has a way of its own; a warp goes on to the next part as long as one of its rays has one.
+Each thread has a way of its own; a warp goes on to the next part as long as one of its rays has one. All of a part is
+written out; the samples of a cube of `qss` and `cubic-c1` are read once. Programs for first hits, Triton 3.7.1, sm_90:
+
+| | qss | cubic-c1 | quadratic-c1 |
+|---|---|---|---|
+| instructions of PTX, float32 | 1,412 | 1,633 | 1,694 |
+| samples read | 27 of a cube | 27 of a cube | 32 of a part |
+| registers, float32; float64 (none is spilled) | 164; 248 | 166; 253 | 149; 248 |
+| to compile, once, one core | 6 s | 9 s | 12 s |
+
+Triton takes nearly all of that time to look which loads of neighbouring threads could be one.
 """
 
 from __future__ import annotations
