@@ -179,6 +179,10 @@ class Lanes:
         """A mask: a < b, false where either is NaN."""
         return self.builder.fcmp_ordered("<", a, b)
 
+    def both(self, a: Value, b: Value) -> Value:
+        """A mask: where two masks hold."""
+        return self.builder.and_(a, b)
+
     def differs(self, a: Value, number: float = 0.0) -> Value:
         """A mask: a ≠ number, NaN included."""
         return self.builder.fcmp_unordered("!=", a, self.constant(number))

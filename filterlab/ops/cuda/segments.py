@@ -19,7 +19,7 @@ from contextlib import AbstractContextManager
 from typing import Protocol
 
 from filterlab.ops.cuda.optics import Lights, shade
-from filterlab.ops.cuda.source import Source
+from filterlab.ops.cuda.source import Source, any_of
 from filterlab.ops.cuda.sums import Sums, sums_of
 from filterlab.ops.cuda.tape import Node, Tape
 from filterlab.ops.cuda.taps import AXES
@@ -97,7 +97,7 @@ class Program:
     def write(self) -> Source:
         self._begin()
         self.begin()
-        with self.source.block("while tl.reduce(goes.to(tl.int32), 0, either) > 0"):
+        with self.source.block(f"while {any_of('goes')}"):
             self._segment()
             self.taps.locate("coefficients")
             self.line("near = goes")
@@ -116,7 +116,7 @@ class Program:
 
     def if_any(self, mask: str) -> AbstractContextManager[None]:
         """The with-block, for all rays of the warp, unless the mask holds for none of them."""
-        return self.source.block(f"if tl.reduce(({mask}).to(tl.int32), 0, either) > 0")
+        return self.source.block(f"if {any_of(mask)}")
 
     # --- rays and segments ---
 
