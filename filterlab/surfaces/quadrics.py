@@ -26,11 +26,11 @@ from torch import Tensor
 from filterlab.fields.base import Domain
 from filterlab.ops import quadrics as described
 from filterlab.ops.differentiable import quadrics as ops
+from filterlab.surfaces import quadric_kinds as kinds
 from filterlab.surfaces.base import Hits, Surface
 from filterlab.surfaces.bounds import Bounds, check_rows
 
 _ROUNDINGS = 16  # of the largest coordinate, by which bounds are larger: neighbours that share a face leave no gap
-_ROOM = 1.01  # what fits a ball is not cut by it
 _SEEN = 1e-12  # of the terms of a test, by which it has to fail
 _MARGIN = 1e-4  # of the diagonal, around all: rays begin outside of what they hit
 _FINEST = 1e-3  # of the diagonal: as the smallest radius counts what is smaller
@@ -43,9 +43,9 @@ class Quadrics(Surface):
         A: (M, 3, 3), float32 or float64; of another one than a symmetric matrix the symmetric part counts.
         b: (M, 3). c: (M,). Differentiable, as A is.
         bounds: `Spheres(centers, radii)`, `Tetrahedra(corners)` or `Planes(halfspaces)`, of as many.
-        cuts: (M, K, 4) or (M, 4): n, d of more halfspaces n·x + d ≤ 0 that are kept, as at sharp edges.
         origins: o (M, 3), in the world; None: its origin. Coefficients about a point nearby keep digits that those far
             away have lost. Differentiable.
+        cuts: (M, K, 4) or (M, 4): n, d of more halfspaces n·x + d ≤ 0 that are kept, as at sharp edges.
         faces: which hits count: "front", from F > 0 to F < 0 along the ray, "back", or "both".
 
     Memory: 124 bytes of working data and 40 of the index for each, and 32 for each plane. The index is built at the
@@ -65,9 +65,9 @@ class Quadrics(Surface):
         b: Tensor,
         c: Tensor,
         bounds: Bounds,
+        origins: Tensor | None = None,
         *,
         cuts: Tensor | None = None,
-        origins: Tensor | None = None,
         faces: str = "both",
     ) -> None:
         if not isinstance(bounds, Bounds):
@@ -98,6 +98,80 @@ class Quadrics(Surface):
 
     def __repr__(self) -> str:
         return f"Quadrics({self.bounds!r}, faces={self.faces!r})"
+
+    # --- kinds ---
+
+    @classmethod
+    def ellipsoids(cls, centers: Tensor, semi_axes: Tensor, *, faces: str = "both") -> Quadrics:
+        """Ellipsoids {x = p + L u, |u| = 1}: F = |L⁻¹ (x − p)|² − 1.
+
+        Args:
+            centers: p (M, 3), in the world.
+            semi_axes: (M,) radii of balls, (M, 3) half lengths along x, y, z, or L (M, 3, 3), whose columns are half
+                axes, or anything that maps the unit ball: √D of a diffusion tensor D. World units.
+            faces: as of `Quadrics`.
+
+        Differentiable in both. Raises TypeError, ValueError: no such tensors; a semi-axis that is not positive; an L
+        that flattens space.
+        """
+        return cls(*kinds.ellipsoids(centers, semi_axes), faces=faces)
+
+    @classmethod
+    def cylinders(
+        cls, starts: Tensor, ends: Tensor, radii: Tensor, *, caps: bool = False, faces: str = "both"
+    ) -> Quadrics:
+        """Round tubes between two points: F = |P y|² / ρ² − 1, y from the middle, P y its part across the axis.
+
+        Args:
+            starts, ends: (M, 3) middles of both ends, in the world.
+            radii: ρ (M,), in world units.
+            caps: whether ends are closed by discs: pieces M … 2 M − 1 at the starts, 2 M … 3 M − 1 at the ends.
+            faces: as of `Quadrics`.
+
+        Differentiable in all three; where a tube ends has none. Raises TypeError, ValueError: no such tensors; a radius
+        that is not positive; a start that is the end.
+        """
+        parts = [kinds.cylinders(starts, ends, radii)]
+        parts += [kinds.discs(starts, starts - ends, radii), kinds.discs(ends, ends - starts, radii)] if caps else []
+        return cls(*kinds.joined(parts), faces=faces)
+
+    @classmethod
+    def cones(
+        cls, apexes: Tensor, bases: Tensor, radii: Tensor, *, caps: bool = False, faces: str = "both"
+    ) -> Quadrics:
+        """Round cones: F = |P y|² / ρ² − (a·y / h)², y from the apex, a the unit axis, h the height.
+
+        Args:
+            apexes, bases: (M, 3), the tips and the middles of the circles they widen to, in the world.
+            radii: ρ (M,) of the circles, in world units.
+            caps: whether circles are closed by discs: pieces M … 2 M − 1.
+            faces: as of `Quadrics`.
+
+        Differentiable and raises as `cylinders`.
+        """
+        parts = [kinds.cones(apexes, bases, radii)]
+        parts += [kinds.discs(bases, bases - apexes, radii)] if caps else []
+        return cls(*kinds.joined(parts), faces=faces)
+
+    @classmethod
+    def paraboloids(
+        cls, apexes: Tensor, bases: Tensor, radii: Tensor, *, caps: bool = False, faces: str = "both"
+    ) -> Quadrics:
+        """Round paraboloids: F = |P y|² / ρ² − a·y / h; arguments as of `cones`."""
+        parts = [kinds.paraboloids(apexes, bases, radii)]
+        parts += [kinds.discs(bases, bases - apexes, radii)] if caps else []
+        return cls(*kinds.joined(parts), faces=faces)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Quadrics]) -> Quadrics:
+        """All in one surface; pieces are numbered one part after the other. Raises ValueError: faces that differ."""
+        faces = {part.faces for part in parts}
+        if len(faces) != 1:
+            raise ValueError(
+                f"quadrics that are joined must show the same faces; got {', '.join(sorted(faces)) or None}"
+            )
+        given = [kinds.Kind(part.A, part.b, part.c, part.bounds, part.origins) for part in parts]
+        return cls(*kinds.joined(given), faces=faces.pop())
 
     # --- what a surface is ---
 
