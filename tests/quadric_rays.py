@@ -166,10 +166,12 @@ def surface_of(quadrics: list[Quadric], faces: str) -> Quadrics:
     return Quadrics(stack("A"), stack("b"), stack("c"), bounds, origins=stack("origin"), faces=faces)
 
 
-def cast(quadrics: list[Quadric], origins: np.ndarray, directions: np.ndarray, faces: str) -> list[np.ndarray]:
+def cast(
+    quadrics: list[Quadric], origins: np.ndarray, directions: np.ndarray, faces: str, farthest: bool = False
+) -> list[np.ndarray]:
     """t of all hits of each ray with its own quadric."""
     surface = surface_of(quadrics, faces)
-    hits = surface.hits(torch.from_numpy(origins), torch.from_numpy(directions), SHEETS)
+    hits = surface.hits(torch.from_numpy(origins), torch.from_numpy(directions), SHEETS, farthest)
     own = hits.piece == torch.arange(len(quadrics))[:, None]
     return [t[mine].numpy() for t, mine in zip(hits.t, own, strict=True)]
 
@@ -180,6 +182,7 @@ def verdict(quadric: str, rays: str, count: int, seed: int) -> dict[str, int]:
     quadrics = [QUADRICS[quadric](rng) for _ in range(count)]
     origins, directions = map(np.array, zip(*(RAYS[rays](rng, q) for q in quadrics), strict=True))
     found = {faces: cast(quadrics, origins, directions, faces) for faces in ("front", "back", "both")}
+    found |= {f"{faces}, farthest": cast(quadrics, origins, directions, faces, True) for faces in ("front", "back")}
     total = {"expected": 0, "missed": 0, "invented": 0, "inconsistent": 0}
     for i, own in enumerate(quadrics):
         if quadric_oracle.lies_on(own, origins[i], directions[i]):
@@ -188,8 +191,9 @@ def verdict(quadric: str, rays: str, count: int, seed: int) -> dict[str, int]:
         total["expected"] += len(expected)
         for faces in ("front", "back"):
             touching = quadric == "double_plane"
-            for name, n in quadric_oracle.judged(expected, found[faces][i], faces == "front", touching).items():
-                total[name] += n
+            for t in (found[faces][i], found[f"{faces}, farthest"][i]):
+                for name, n in quadric_oracle.judged(expected, t, faces == "front", touching).items():
+                    total[name] += n
         total["inconsistent"] += not np.array_equal(
             found["both"][i], np.sort(np.concatenate([found[f][i] for f in ("front", "back")]))
         )

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from filterlab.ops.differentiable import quadrics
 from filterlab.ops.reference import quadrics as reference
 from filterlab.render import PerspectiveCamera, raycast
 from filterlab.render.silhouettes import Silhouettes
@@ -54,8 +55,21 @@ NONE = torch.zeros(3, 3).tolist()
 # --- hits -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def plain(monkeypatch):
+    """Plain torch in place of the program."""
+    monkeypatch.setattr(quadrics, "missing", lambda *given: "it is not asked for")
+
+
+@pytest.fixture(params=["fused", "plain"])
+def either(request):
+    """By the program where it runs, and in plain torch."""
+    if request.param == "plain":
+        request.getfixturevalue("plain")
+
+
 @pytest.mark.parametrize("quadric", quadric_rays.QUADRICS)
-def test_every_hit_is_found_and_no_other(quadric):
+def test_every_hit_is_found_and_no_other(quadric, either):
     expected = 0
     for kind in quadric_rays.RAYS:
         found = quadric_rays.verdict(quadric, kind, 12, 0)
@@ -64,7 +78,7 @@ def test_every_hit_is_found_and_no_other(quadric):
     assert expected > 8
 
 
-def test_a_touching_ray_hits_once():
+def test_a_touching_ray_hits_once(either):
     origins = numbers([-3, 1, 0], [-3, 1 + 1e-12, 0], [-3, 1 - 1e-12, 0])
     t = one(SPHERE, [0, 0, 0], -1.0, 1.1).hits(origins, numbers([1, 0, 0]), 3).t
     assert t.isfinite().sum(-1).tolist() == [1, 0, 2]
@@ -72,7 +86,7 @@ def test_a_touching_ray_hits_once():
 
 
 @pytest.mark.parametrize("direction", [[1.0, 0, 0], [3.0, 4, 0], [1.0, 1, 8], [0.0, 0, 2]])
-def test_the_apex_of_a_cone(direction):
+def test_the_apex_of_a_cone(direction, either):
     d = numbers(direction)
     hit = one(CONE, [0, 0, 0], 0.0).hits(-3 * d, d, 3)
     assert hit.t[0].tolist() == [3, math.inf, math.inf]
@@ -82,7 +96,7 @@ def test_the_apex_of_a_cone(direction):
 
 
 @pytest.mark.parametrize("direction", [[1.0, 0, 1], [0.0, 3, -3]])
-def test_a_ray_on_the_surface_hits_where_it_enters_the_bounds(direction):
+def test_a_ray_on_the_surface_hits_where_it_enters_the_bounds(direction, either):
     d = numbers(direction)
     t = one(CONE, [0, 0, 0], 0.0).hits(-3 * d, d, 3).t
     assert t[0, 0].item() == pytest.approx(3 - 1 / d.norm().item(), rel=1e-13)
@@ -93,7 +107,7 @@ def test_a_ray_on_the_surface_hits_where_it_enters_the_bounds(direction):
     assert t[:, 1].tolist() == [math.inf] * 3
 
 
-def test_a_double_plane_is_solid():
+def test_a_double_plane_is_solid(either):
     """(n·x)² is 0 on both sides of nothing: β² − αγ is rounding, of any sign."""
     n = numbers([0.3, -0.7, 0.64]).T
     surface = one((n @ n.T).tolist(), [0, 0, 0], 0.0)
@@ -121,7 +135,7 @@ def every(surface: Quadrics, origins: Tensor, directions: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("count", [1, 7, 64, 65, 700])
-def test_all_sheets_of_many(count):
+def test_all_sheets_of_many(count, either):
     surface, (origins, directions) = balls(count), rays(300)
     expected = every(surface, origins, directions)
     k = min(8, expected.shape[1])
@@ -136,6 +150,17 @@ def test_all_sheets_of_many(count):
     assert torch.equal(surface.met(origins, directions), first.valid)
 
 
+@pytest.mark.parametrize("faces", ["front", "back", "both"])
+def test_the_farthest_are_the_same_from_behind(faces, either):
+    surface, (origins, directions) = balls(faces=faces), rays(200)
+    near, far = (surface.hits(origins, directions, 30, farthest) for farthest in (False, True))
+    count = near.valid.sum(-1)
+    assert 2 < int(count.max()) < 30
+    for t, back, n in zip(near.t, far.t, count, strict=True):
+        torch.testing.assert_close(t[:n].flip(0), back[:n], rtol=1e-11, atol=0)
+        assert not bool(back[n:].isfinite().any())
+
+
 def test_pieces_tell_which_quadric_is_hit():
     surface, (origins, directions) = balls(), rays(200)
     hits = surface.hits(origins, directions, 4)
@@ -148,7 +173,7 @@ def test_pieces_tell_which_quadric_is_hit():
     torch.testing.assert_close(at.normal[own], outward[own])
 
 
-def test_memory_does_not_grow_with_pairs(monkeypatch):
+def test_memory_does_not_grow_with_pairs(plain, monkeypatch):
     """A stack of a few pairs at a time finds the same."""
     surface, (origins, directions) = balls(700), rays(300)
     expected = surface.hits(origins, directions, 5)

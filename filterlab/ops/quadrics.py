@@ -13,6 +13,7 @@ and β² − αγ loses no digits to the distance of the eye. The ball is |ρ| �
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -78,6 +79,19 @@ class Quadrics:
     def planes(self) -> int:
         """H."""
         return (self.leaves.shape[1] - PLANES) // 4
+
+    def kept(self, reversed: bool) -> Kept:
+        """Which hits count of rays that go as directions say, or the other way round."""
+        falls, rises = self.faces != "back", self.faces != "front"
+        return Kept(*((rises, falls) if reversed else (falls, rises)), falls)
+
+
+class Kept(NamedTuple):
+    """Whether hits count where F falls along u, where it rises, and where both are one."""
+
+    falls: bool
+    rises: bool
+    touches: bool
 
 
 @dataclass(frozen=True)

@@ -93,9 +93,9 @@ class Tree:
         moved = {name: getattr(self, name).to(device) for name in ("order", "center", "boxes", "children")}
         return replace(self, own=own, **moved)
 
-    @property
-    def leaves(self) -> int:
-        return max(1, -(-len(self.order) // WIDTH))
+    def numbers(self, place: Tensor) -> Tensor:
+        """Of the things in places; −1 of none, the place −1."""
+        return torch.nn.functional.pad(self.order, (0, 1), value=-1)[place]
 
 
 def in_leaves(rows: Tensor, missing: float) -> Tensor:

@@ -32,6 +32,7 @@ from filterlab.ops.quadrics import (
     SMALLEST,
     SQUARE,
     VECTOR,
+    Kept,
     Quadrics,
     Rays,
 )
@@ -71,7 +72,7 @@ def _of_part(
         leaves = pairs.some(pairs.node < 0)
         if len(leaves.ray):
             table.take(*_in_leaves(given, rays, leaves.ray, -1 - leaves.node))
-    return rays.t(table.tau), table.numbers(given)
+    return rays.t(table.tau), given.tree.numbers(table.place)
 
 
 class _Pairs(NamedTuple):
@@ -117,22 +118,26 @@ def _below(given: Quadrics, rays: Rays, pairs: _Pairs) -> _Pairs:
 def _in_leaves(given: Quadrics, rays: Rays, ray: Tensor, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """All hits of rays in leaves (Q,): numbers of rays, τ, and places (M,)."""
     start, along, first, last = (x[ray] for x in (rays.start, rays.along, rays.first, rays.last))
-    tau = intersections(given.leaves[leaf], start, along, first, last, given.faces)
+    kept = given.kept(rays.reversed)
+    tau = intersections(given.leaves[leaf], start, along, first, last, kept, rays.reversed)
     pair, lane, _ = hit = (tau < torch.inf).nonzero().unbind(1)
     return ray[pair], tau[hit], given.leaves.shape[-1] * leaf[pair] + lane
 
 
-def intersections(leaf: Tensor, start: Tensor, along: Tensor, first: Tensor, last: Tensor, faces: str) -> Tensor:
+def intersections(
+    leaf: Tensor, start: Tensor, along: Tensor, first: Tensor, last: Tensor, kept: Kept, reversed: bool
+) -> Tensor:
     """τ (Q, 8, 2) where rays (Q, 3) meet the quadrics of leaves (Q, K, 8): front and back; ∞ where they don't."""
     u = along.unsqueeze(-1)
     p = start.unsqueeze(-1) - leaf[:, CENTER]
     behind = -(p * u).sum(1)
     q = p + behind[:, None] * u
     near, far = _clipped(leaf, q, u, first[:, None] - behind, last[:, None] - behind)
-    roots = _roots(leaf, q, u, near)
+    front, back, one = _roots(leaf, q, u, far if reversed else near)
+    counts = torch.stack((torch.where(one, kept.touches, kept.falls), ~one & kept.rises), -1)
+    roots = torch.stack((front, back), -1)
     within = (roots >= near[..., None]) & (roots <= far[..., None])
-    kept = within & torch.tensor([faces != "back", faces != "front"], device=leaf.device)
-    return torch.where(kept, roots + behind[..., None], torch.inf)
+    return torch.where(within & counts, roots + behind[..., None], torch.inf)
 
 
 def _clipped(leaf: Tensor, q: Tensor, u: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
@@ -149,8 +154,8 @@ def _clipped(leaf: Tensor, q: Tensor, u: Tensor, first: Tensor, last: Tensor) ->
     return near, far
 
 
-def _roots(leaf: Tensor, q: Tensor, u: Tensor, near: Tensor) -> Tensor:
-    """ρ (Q, 8, 2) of front and back, wherever they are; NaN or infinite where there is none."""
+def _roots(leaf: Tensor, q: Tensor, u: Tensor, entry: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """ρ (Q, 8) of front and back, wherever they are, NaN or infinite where there is none; and whether they are one."""
     a, b, c = leaf[:, MATRIX], leaf[:, VECTOR], leaf[:, CONSTANT]
     turned = _times(a, q)
     alpha = (u * _times(a, u)).sum(1)
@@ -170,8 +175,8 @@ def _roots(leaf: Tensor, q: Tensor, u: Tensor, near: Tensor) -> Tensor:
     touches = radicand.abs() <= slack
     on = (alpha.abs() <= rounding * size_a) & (beta.abs() <= rounding * size_beta)
     on = on & (gamma.abs() <= rounding * size_gamma)
-    front = torch.where(on, near, torch.where(touches, -beta / alpha, front))
-    return torch.stack((front, torch.where(on | touches, torch.nan, back)), -1)
+    front = torch.where(on, entry, torch.where(touches, -beta / alpha, front))
+    return front, back, on | touches
 
 
 def _times(a: Tensor, x: Tensor) -> Tensor:
@@ -209,7 +214,3 @@ class _Table:
         fits = rank < self.tau.shape[1]
         where = ray[fits], rank[fits]
         self.tau[where], self.place[where] = tau[fits], place[fits]
-
-    def numbers(self, given: Quadrics) -> Tensor:
-        """Of the quadrics in their places; −1, the last one, of none."""
-        return torch.nn.functional.pad(given.tree.order, (0, 1), value=-1)[self.place]
