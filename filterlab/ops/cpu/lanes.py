@@ -142,6 +142,10 @@ class Lanes:
         product = self.multiply(a, b)
         return product if c is None else self.add(product, c)
 
+    def fused(self, a: Value, b: Value, c: Value) -> Value:
+        """a · b + c with one rounding, whatever the machine has: slow where that is no instruction."""
+        return self._intrinsic(f"llvm.fma.v{self.count}f{self.bits}", self.pack, [a, b, c])
+
     def polynomial(self, coefficients: Sequence[float], u: Value) -> Value:
         """Σ_j coefficients[j] u^j by Horner's rule; NaN where u is NaN, even for a constant."""
         *lower, highest = coefficients
