@@ -491,7 +491,9 @@ def test_directions_may_have_any_length():
 
 
 def test_surfaces_are_public():
-    assert set(surfaces.__all__) == {"Hits", "LevelSet", "Mesh", "Surface", "SurfacePoints", "mesh"}
+    level_sets = {"Hits", "LevelSet", "Mesh", "Surface", "SurfacePoints", "mesh"}
+    quadrics = {"Bounds", "Planes", "Quadrics", "Spheres", "Tetrahedra"}
+    assert set(surfaces.__all__) == level_sets | quadrics
 
 
 def test_a_level_and_samples_that_change_in_place_are_seen() -> None:
