@@ -6,11 +6,14 @@ import math
 import os
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
 from filterlab.cli.outcome import UsageError, first_line
+
+if TYPE_CHECKING:
+    from filterlab.io.bounded import VolumeHeader
 
 Triple = tuple[float, float, float]
 Output = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
@@ -36,6 +39,20 @@ def check_name(what: str, name: str, known: object) -> None:
     names = [str(k) for k in known]  # type: ignore[attr-defined]
     if name not in names:
         raise ValueError(unknown_name(what, name, names))
+
+
+INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
+FLOATS = ("float32", "float64")
+
+
+def result_type(name: str, source: VolumeHeader) -> str:
+    """The type in the file that is asked for, by NumPy's name; `input` is that of the volume."""
+    check_name("dtype", name, [*FLOATS, *INTEGERS, "input"])
+    if name != "input":
+        return name
+    if source.dtype.is_floating_point:
+        return str(source.dtype).removeprefix("torch.")
+    return source.stored if source.stored in INTEGERS else "uint8"  # bool
 
 
 def check_device(name: str) -> None:
