@@ -10,16 +10,12 @@ becomes a field:
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from filterlab.names import NAN_CHOICES
 from filterlab.ops.differentiable.recording import transformed
-
-NanChoice = Literal["refuse", "propagate", "fill"]
-CHOICES: tuple[str, ...] = get_args(NanChoice)
 
 
 def resolved(samples: Tensor, choice: str) -> tuple[Tensor, Tensor | None]:
@@ -31,8 +27,8 @@ def resolved(samples: Tensor, choice: str) -> tuple[Tensor, Tensor | None]:
     Raises:
         ValueError: an unknown choice; with "refuse", how many voxels are not finite; a volume without a finite voxel.
     """
-    if choice not in CHOICES:
-        raise ValueError(f"nan must be one of {', '.join(CHOICES)}; got {choice!r}")
+    if choice not in NAN_CHOICES:
+        raise ValueError(f"nan must be one of {', '.join(NAN_CHOICES)}; got {choice!r}")
     if not samples.dtype.is_floating_point or transformed() or _all_finite(samples):
         return samples, None
     unknown = ~samples.detach().isfinite()

@@ -19,7 +19,9 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 # each room may import the rooms before it (and itself); the same number: neither imports the other
 FLOORS = {
-    "world": -1,
+    "names": -2,
+    "world": -2,
+    "geometry": -1,
     "forking": 0,
     "volume": 0,
     "kernels": 0,

@@ -77,7 +77,7 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_line_that_makes_no_sense(capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.nrrd"
-    known = "render, mesh, sdf, resample, convert, recommend, methods, info"
+    known = "render, mesh, scene, sdf, resample, convert, recommend, methods, info"
     fails(capsys, ["rendr"], 2, f"unknown command 'rendr'; did you mean 'render'? known commands: {known}")
     fails(capsys, ["resample", volume_file], 2, "--output")
     fails(capsys, ["resample", volume_file, "-o", out], 2, "one of --spacing, --shape and --like; got none")
@@ -99,6 +99,15 @@ def test_the_installed_command_in_its_own_process(tmp_path: Path) -> None:
 def test_help_does_not_wait_for_torch() -> None:
     code = "import sys; from filterlab.cli import main; main(['render', '--help']); sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def test_convert_does_not_wait_for_torch_to_refuse(tmp_path: Path) -> None:
+    np.save(tmp_path / "in.npy", np.zeros((2, 3, 4)))
+    lines = [["out.tif"], ["out.npz", "--dtype", "uint9"], ["out.npz", "--frame", "3"], ["no/out.npz"]]
+    lines = [["convert", str(tmp_path / "in.npy"), str(tmp_path / out), *more] for out, *more in lines]
+    code = f"import sys; from filterlab.cli import main; print([main(a) for a in {lines}], 'torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[1, 1, 1, 1] False\n"
 
 
 def test_split_overrides() -> None:

@@ -153,8 +153,8 @@ def test_volume_files_are_found_beside_the_scene_and_by_variables(scene_file, tm
         ({"method": "{name: notch, boundary: periodic}"}, "known boundarys|boundary.*wrap"),
         ({"method": "{name: tricubic, gradient: central}"}, "offers the gradients analytic"),
         ({"signal.samples": "null", "method": "notch"}, "needs no method"),
-        ({"transfer.points": "[{value: 0, color: [1, 1, 1], opacity: 0.5}]"}, "transfer.*got both"),
-        ({"transfer": "{}"}, "expected points or peaks"),
+        ({"transfer.points": "[{value: 0, color: [1, 1, 1], opacity: 0.5}]"}, "transfer.*points and peaks"),
+        ({"transfer": "{}"}, "expected points, peaks or a colormap"),
         ({"transfer.peaks[0].height": "2"}, r"transfer.peaks\[0\].height"),
         ({"transfer.peaks[0].centre": "2"}, "centre.*did you mean 'center'"),
         ({"camera": "{position: [0, 0, 0]}"}, "camera.*position and target together"),
@@ -198,7 +198,9 @@ def test_a_signal_that_cannot_be_computed_is_refused(scene_file, monkeypatch):
 def test_a_scene_shows_one_volume(scene_file, tmp_path, monkeypatch):
     save_volume(torch.rand(1, 2, 3, 4, 5), tmp_path / "batch.npz")
     path = scene_file(MINIMAL.replace("signal: {name: marschner-lobb, samples: 12}", "volume: batch.npz"))
-    monkeypatch.setattr("filterlab.scenes.model.load_volume", lambda *_: pytest.fail("the voxels must not be read"))
+    monkeypatch.setattr(
+        "filterlab.scenes.model.sources.load_volume", lambda *_: pytest.fail("the voxels must not be read")
+    )
     with pytest.raises(ValueError, match=r"batch\.npz: expected one volume of shape \(D, H, W\).*\(1, 2, 3, 4, 5\)"):
         render_scene(load_scene(path))
 

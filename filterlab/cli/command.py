@@ -22,10 +22,12 @@ from filterlab.cli.outcome import FAILED, INTERRUPTED, OK, USAGE, UsageError, me
 from filterlab.cli.recommend import Recommend
 from filterlab.cli.render import Render
 from filterlab.cli.resample import Resample
+from filterlab.cli.scene import Scene
 from filterlab.cli.scenes import split_overrides
 from filterlab.cli.sdf import Sdf
 from filterlab.cli.terminal import tell
 from filterlab.io.warned import VolumeFileWarning
+from filterlab.names import unknown_name
 
 DESCRIPTION = """Reconstruction filters for sampled volumes: look at scans, resample and convert them, compare methods.
 
@@ -34,6 +36,7 @@ filterlab COMMAND --help tells more, with examples. filterlab --version tells th
 COMMANDS: dict[str, Any] = {
     "render": Render,
     "mesh": Mesh,
+    "scene": Scene,
     "sdf": Sdf,
     "resample": Resample,
     "convert": Convert,
@@ -41,7 +44,7 @@ COMMANDS: dict[str, Any] = {
     "methods": Methods,
     "info": Info,
 }
-SHOWING: dict[str, Any] = {"render": Render, "mesh": Mesh}
+SHOWING: dict[str, Any] = {"render": Render, "mesh": Mesh, "scene": Scene}
 """Those that take a scene, and changes to it."""
 
 
@@ -101,8 +104,6 @@ def _parse(arguments: list[str]) -> Any:
     """The command that was asked for. tyro prints help and mistakes of usage, and exits."""
     name = arguments[0]
     if name not in COMMANDS and not name.startswith("-"):
-        from filterlab.io.config import unknown_name
-
         tell(unknown_name("command", name, COMMANDS))
         raise SystemExit(USAGE)
     if name in COMMANDS:

@@ -68,4 +68,4 @@ class Convert:
 
     def _keeps(self, source: VolumeHeader) -> bool:
         """Whether values are written as they are read, which is in a wider type where a format lacks theirs."""
-        return self.dtype == "input" and source.dtype.is_floating_point
+        return self.dtype == "input" and source.sample_type.kind == "f"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from filterlab.cli.loading import load
+from filterlab.cli.loading import reading
 from filterlab.cli.options import Channel, Frame
 from filterlab.cli.terminal import progress_bar, show, tell
 from filterlab.world import RAS, World
@@ -47,7 +47,7 @@ class Info:
         from rich.table import Table
         from rich.text import Text
 
-        from filterlab.io.volumes import describe
+        from filterlab.io.volumes import MAX_BYTES, describe
 
         header = describe(self.file, frame=self.frame, channel=self.channel)
         table = Table(show_header=False, box=None)
@@ -56,8 +56,9 @@ class Info:
         show(table)
         if not self.header_only and _tell_open_choice(header):
             with progress_bar() as progress:
-                volume = load(self.file, self.frame, self.channel, progress)
-                found = _distribution(volume.samples.numpy(), lambda done: progress(done, "counting"))
+                with reading(progress):
+                    samples = header.read(MAX_BYTES)
+                found = _distribution(samples, lambda done: progress(done, "counting"))
             table = Table(show_header=False, box=None)
             for name, value in found:
                 table.add_row(name, Text(value))
@@ -71,7 +72,7 @@ def _described(header: VolumeHeader) -> list[tuple[str, str]]:
     def numbers(values: Sequence[float]) -> str:
         return " ".join(f"{v:.6g}" for v in values)
 
-    dtype = str(header.dtype).removeprefix("torch.")
+    dtype = header.sample_type.name
     extent = [n * s for n, s in zip(header.size, header.spacing, strict=True)]
     lines = [
         ("file", f"{header.path} ({header.format}, {header.encoding})"),

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
 from filterlab.cli.outcome import UsageError, first_line
+from filterlab.names import unknown_name
 
 if TYPE_CHECKING:
     from filterlab.io.bounded import VolumeHeader
@@ -33,12 +35,10 @@ def check_not_input(output: Path, source: Path) -> None:
         raise ValueError(f"expected an output other than the input; got {output} for both")
 
 
-def check_name(what: str, name: str, known: object) -> None:
-    from filterlab.io.config import unknown_name
-
-    names = [str(k) for k in known]  # type: ignore[attr-defined]
-    if name not in names:
-        raise ValueError(unknown_name(what, name, names))
+def check_name(what: str, name: str, known: Collection[str]) -> None:
+    """Raises ValueError for a name that is not known."""
+    if name not in known:
+        raise ValueError(unknown_name(what, name, known))
 
 
 INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
@@ -50,8 +50,8 @@ def result_type(name: str, source: VolumeHeader) -> str:
     check_name("dtype", name, [*FLOATS, *INTEGERS, "input"])
     if name != "input":
         return name
-    if source.dtype.is_floating_point:
-        return str(source.dtype).removeprefix("torch.")
+    if source.sample_type.kind == "f":
+        return source.sample_type.name
     return source.stored if source.stored in INTEGERS else "uint8"  # bool
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from filterlab import names
 from filterlab.cli.loading import load
 from filterlab.cli.options import MEMORY, TIME, Channel, Frame, Quiet, check_name, quantity
 from filterlab.cli.outcome import NOTHING_FITS, OK
@@ -64,17 +65,17 @@ class Recommend:
                 raise ValueError(f"expected a scene's name that ends in .yaml; got {self.output}")
             output = OutputFile.at(self.output, self.volume, quiet=self.quiet)
 
-        from filterlab.io.volumes import describe
-        from filterlab.missing_values import CHOICES, resolved
-        from filterlab.recommendation import TASKS, recommend, report
-        from filterlab.volume import Boundary
-
         for what, name, known in (
-            ("task", self.task, TASKS),
-            ("boundary", self.boundary, Boundary),
-            ("nan", self.nan, CHOICES),
+            ("task", self.task, names.TASKS),
+            ("boundary", self.boundary, names.BOUNDARIES),
+            ("nan", self.nan, names.NAN_CHOICES),
         ):
             check_name(what, name, known)
+
+        from filterlab.io.volumes import describe
+        from filterlab.missing_values import resolved
+        from filterlab.recommendation import recommend, report
+
         part = {"frame": self.frame, "channel": self.channel}
         if self.output is not None and len(shape := describe(self.volume, **part).shape) != 3:
             raise ValueError(f"expected one volume (D, H, W) to write a scene of; {self.volume} has {tuple(shape)}")

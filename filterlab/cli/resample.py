@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from filterlab import names
 from filterlab.cli.loading import load
 from filterlab.cli.memory import as_float, check_memory, limit_in_bytes
 from filterlab.cli.options import Channel, Frame, Output, Quiet, Triple, check_name, result_type
@@ -97,24 +98,26 @@ class Resample:
         self._check_convention()
         output = OutputFile.at(self.output, self.input, self.like, self.affine, quiet=self.quiet)
 
+        check_name("method", self.method, names.methods())
+        check_name("boundary", self.boundary, names.BOUNDARIES)
+        check_name("nan", self.nan, names.NAN_CHOICES)
+
         import numpy as np
-        import torch
 
         from filterlab.io.volumes import check_saveable, describe
-        from filterlab.methods import METHODS
-        from filterlab.missing_values import CHOICES
-        from filterlab.resampling import resample
-        from filterlab.volume import Boundary, Volume
 
-        check_name("method", self.method, METHODS)
-        check_name("boundary", self.boundary, Boundary)
-        check_name("nan", self.nan, CHOICES)
         source = describe(self.input, frame=self.frame, channel=self.channel)
         source.check_choice()
         target = None if self.like is None else describe(self.like)
         affine = self._affine(source, target)
         keeps = self.labels or self.method == "nearest"
         stored = None if self.dtype is None and not keeps else result_type(self.dtype or "input", source)
+
+        import torch
+
+        from filterlab.resampling import resample
+        from filterlab.volume import Volume
+
         working = _working_type(stored, source)
         check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)
         self._check_fill(stored)

@@ -67,8 +67,9 @@ SchemeJet = TypeVar("SchemeJet", bound=Callable[..., Tensor])
 def with_exact_positions(jet: SchemeJet) -> SchemeJet:
     """Lets a scheme place its samples in float64, and returns the result in the type of the points.
 
-    A float32 position x ± δ is rounded to 6e-8·x voxels, as a texture coordinate is: at 512 voxels that alone cost up
-    to 8e-5 of the range in a gradient. The direct sum moves no point and needs no such care.
+    A float32 position x ± δ is rounded to 6e-8·x voxels, as a texture coordinate is: in noise of 512 voxels that alone
+    cost 1.1e-4 of the range in a triquadratic gradient, the most of 200,000 points. The direct sum moves no point and
+    needs no such care.
     """
 
     @wraps(jet)

@@ -19,15 +19,19 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from filterlab.geometry import Geometry
 from filterlab.io import itk
 from filterlab.io.bounded import VolumeFileError, VolumeHeader, number, regular_file
-from filterlab.io.config import unknown_name
-from filterlab.volume import Geometry, Volume
+from filterlab.names import unknown_name
 
-Grid = Volume | VolumeHeader
+if TYPE_CHECKING:
+    from filterlab.volume import Volume
+
+Grid: TypeAlias = "Volume | VolumeHeader"
 MAX_BYTES = 2**16  # of a matrix as text
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 

@@ -24,7 +24,7 @@ from filterlab.io.bounded import (
     Choice,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     beside,
     check_geometry,
     check_size,
@@ -123,7 +123,7 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
 
     def read() -> Any:
         array = _read(path, sitk, names).reshape(frames, *size[::-1], channels)
-        return as_tensor(path, array[t, ..., c], target)
+        return as_samples(path, array[t, ..., c], target)
 
     fields = {"kind": kind} | ({"files": str(len(names))} if path.is_dir() else {})
     held = frames * channels * math.prod(size)

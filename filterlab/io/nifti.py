@@ -18,17 +18,16 @@ import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from filterlab.io.bounded import (
     Choice,
     Stored,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     check_geometry,
     check_size,
     damaged,
@@ -36,8 +35,10 @@ from filterlab.io.bounded import (
     sample_dtype,
     storable,
 )
-from filterlab.volume import Volume
 from filterlab.world import RAS, NiftiForms, World
+
+if TYPE_CHECKING:
+    from filterlab.volume import Volume
 
 MAX_NIFTI1_AXIS = 32767
 HEADER_BYTES = {348: 352, 540: 544}  # sizeof_hdr -> bytes up to the first possible voxel
@@ -114,7 +115,7 @@ def _checked(
     at = (0 if colours > 1 else c, t, None, None, None, c if colours > 1 else 0)
     slope, intercept = (1.0, 0.0) if colours > 1 else _scaling(path, header)
     plain = (slope, intercept) == (1.0, 0.0)
-    wide = torch.float64 if dtype.itemsize > 2 and dtype.name != "float32" else torch.float32
+    wide = np.dtype("float64" if dtype.itemsize > 2 and dtype.name != "float32" else "float32")
     target = stored_dtype if plain else wide
     affine, world, source = _place(header, kind)
     return VolumeHeader(
@@ -129,7 +130,7 @@ def _checked(
         choice,
         stored.held(at),
         lambda: (
-            as_tensor(path, stored.read(at), target) if plain else rescaled(stored.read(at), slope, intercept, target)
+            as_samples(path, stored.read(at), target) if plain else rescaled(stored.read(at), slope, intercept, target)
         ),
     )
 

@@ -19,7 +19,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from filterlab.io.bounded import (
     Stored,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     beside,
     check_geometry,
     check_size,
@@ -39,8 +39,10 @@ from filterlab.io.bounded import (
     sample_dtype,
     storable,
 )
-from filterlab.volume import Volume
 from filterlab.world import ANATOMICAL, SPACES, UNIT, World
+
+if TYPE_CHECKING:
+    from filterlab.volume import Volume
 
 _TYPES = {
     "int8": ("signed char", "int8", "int8_t"),
@@ -111,7 +113,7 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
         target,
         choice,
         0 if stored is None else stored.held(at),
-        lambda: as_tensor(path, itk.read_nrrd(path, size[::-1], dtype) if stored is None else stored.read(at), target),
+        lambda: as_samples(path, itk.read_nrrd(path, size[::-1], dtype) if stored is None else stored.read(at), target),
     )
 
 

@@ -20,12 +20,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import numpy as np
-import torch
 from pydantic import Field
-from torch import Tensor
 
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import (
@@ -35,7 +33,7 @@ from filterlab.io.bounded import (
     Stored,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     check_geometry,
     check_size,
     native,
@@ -46,7 +44,9 @@ from filterlab.io.bounded import (
     scaled,
 )
 from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, dump_config, load_config
-from filterlab.volume import Volume
+
+if TYPE_CHECKING:
+    from filterlab.volume import Volume
 
 Count = Annotated[int, Field(ge=1)]
 Row = tuple[float, float, float, float]
@@ -133,9 +133,9 @@ class Part:
             shape = (*batch, *shape[2:]) if None in (first, second) else shape[2:]
         return cls(choice, at[::-1] if fortran else at, shape, fortran)
 
-    def tensor(self, path: Path, array: np.ndarray, target: torch.dtype) -> Tensor:
+    def samples(self, path: Path, array: np.ndarray, target: np.dtype) -> np.ndarray:
         """What was read, its axes the right way round."""
-        return as_tensor(path, (array.T if self.fortran else array).reshape(self.shape), target)
+        return as_samples(path, (array.T if self.fortran else array).reshape(self.shape), target)
 
 
 def read_npy_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
@@ -158,7 +158,7 @@ def read_npy_header(path: Path, frame: int | None = None, channel: int | None = 
         target,
         part.choice,
         stored.held(part.at),
-        lambda: part.tensor(path, stored.read(part.at), target),
+        lambda: part.samples(path, stored.read(part.at), target),
     )
 
 
@@ -240,11 +240,11 @@ def read_npz_header(path: Path, frame: int | None = None, channel: int | None = 
         affine = _npz_affine(path, archive, members)
     part = Part.of(path, shape, fortran, frame, channel)
 
-    def read() -> Tensor:
+    def read() -> np.ndarray:
         with _archive(path) as (archive, _), _member(path, archive, info) as stream:
             stream.read(offset)
             array = read_array(path, stream, _stored_order(shape, fortran), dtype, part.at, raw=False)
-        return part.tensor(path, array, target)
+        return part.samples(path, array, target)
 
     return VolumeHeader(
         path,
@@ -297,7 +297,8 @@ def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile
 
 def _samples(path: Path, volume: Volume, stored: str | None) -> Outgoing:
     samples = volume.samples.detach().cpu().contiguous()
-    return Outgoing.of(path, (samples.float() if samples.dtype == torch.bfloat16 else samples).numpy(), stored)
+    widened = samples.float() if str(samples.dtype) == "torch.bfloat16" else samples
+    return Outgoing.of(path, widened.numpy(), stored)
 
 
 def write_npy(volume: Volume, path: Path, stored: str | None = None) -> None:

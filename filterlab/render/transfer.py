@@ -11,7 +11,9 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from filterlab.io.images import from_srgb
 from filterlab.ops.reference.optics import Table
+from filterlab.render.colormaps import encoded_entries
 
 Numbers = Sequence[float] | Tensor
 Peak = tuple[float | Tensor, float | Tensor, float | Tensor, Numbers]
@@ -76,6 +78,42 @@ class TransferFunction(Table):
         weights = torch.where(total > 0, shares, touching + torch.finfo(x.dtype).tiny)
         rgb = (weights / weights.sum(-1, keepdim=True)) @ colors
         return cls(x, rgb, total[:, 0], unit)
+
+    @classmethod
+    def from_colormap(
+        cls,
+        name: str,
+        opacities: Sequence[tuple[float, float]],
+        ends: tuple[float, float] | None = None,
+        unit: float = 1.0,
+    ) -> Self:
+        """The colours of a colormap under a ramp of opacities.
+
+        Control points are the N entries of the colormap, decoded from sRGB, at x_i = a + (b − a) i/(N − 1), and the
+        corners of the ramp. There the opacity is that of the ramp, linear between its corners, constant beyond.
+
+        Args:
+            name: of a colormap of matplotlib; those of few colours are blended.
+            opacities: (value, opacity) corners of the ramp, values increasing.
+            ends: the values (a, b) of the colormap's first and last colour; default the ends of the ramp.
+
+        Raises:
+            ValueError: no such colormap; no ramp, or one whose values do not increase; ends that do not.
+        """
+        entries = from_srgb(encoded_entries(name))
+        values, alphas = [value for value, _ in opacities], [opacity for _, opacity in opacities]
+        ramp = cls(values, [(0.0, 0.0, 0.0)] * len(values), alphas, unit)
+        low, high = ends or (float(values[0]), float(values[-1]))
+        if not low < high:
+            raise ValueError(
+                f"expected the value of a colormap's first colour below that of its last; got {low:g}, {high:g}"
+            )
+        colors = cls(
+            torch.linspace(low, high, len(entries), dtype=torch.float64), entries, entries.new_zeros(len(entries))
+        )
+        x = torch.cat((colors.positions, ramp.positions)).sort().values
+        x = x[torch.cat((x.new_ones(1, dtype=torch.bool), x.diff() > _FOOT * (high - low)))]
+        return cls(x, colors.color(colors.locate(x)), ramp.opacity(ramp.locate(x)), unit)
 
     @property
     def requires_grad(self) -> bool:

@@ -24,6 +24,8 @@ from filterlab.render.bricks import bricks_of
 from filterlab.render.plain import PlainMarcher
 from filterlab.volume import Volume
 from tests.ops.test_cuda_march import LIT, SCENE, SOFT, blob, camera_for, moved, volume
+from tests.ops.test_march import segment_without_length
+from tests.render.test_fused import CONTROL_POINTS
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}
 EVERYTHING = {
@@ -147,6 +149,30 @@ def test_any_number_of_control_points(points: int, device: str, monkeypatch: pyt
     found = assert_agrees(prepared("trilinear", TransferFunction(x, rgb, alpha, 0.5), size=(4, 3)), device)
     assert found["opacities"].shape == (points,)
     assert found["opacities"].abs().min() > 1e-3
+
+
+@pytest.mark.parametrize("way", CONTROL_POINTS)
+def test_at_a_control_point_derivatives_are_those_to_its_right(way: str, device: str) -> None:
+    """Where values are exactly those of control points, a slice for each."""
+    x = torch.tensor(CONTROL_POINTS[way], dtype=torch.float64)
+    alpha = torch.rand(len(x), generator=torch.Generator().manual_seed(4), dtype=torch.float64) / 2
+    transfer = TransferFunction(x, torch.rand(len(x), 3).double(), alpha, 2.0)
+    marched = prepared("trilinear", transfer, x[:, None, None].expand(-1, 2, 4).clone())
+    entry = torch.tensor([[-0.5, 0.5, k] for k in range(len(x))]).double()
+    ones = torch.ones(len(x), dtype=torch.float64)
+    along = torch.tensor([[1.0, 0.0, 0.0]]).double().expand_as(entry)
+    chords = march.Chords(entry, along, 4 * ones, ones, torch.full((len(x),), 4))
+    found = assert_agrees(replace(marched, chords=chords, step=1.0), device)
+    assert (found["coefficients"].abs().sum((1, 2)) > 1e-3).sum() == len(x)
+
+
+def test_a_segment_without_length_adds_nothing_however_opaque(device: str) -> None:
+    marched = segment_without_length()
+    found = assert_agrees(moved(marched, "cpu"), device)
+    assert all(x.isfinite().all() for x in found.values())
+    light, depth = (x.cpu() for x in op.run(moved(marched, device), implementation="cuda"))
+    assert depth.item() == pytest.approx(-3 * math.log1p(-0.25), rel=1e-14)
+    assert light.tolist() == [pytest.approx([1 - 0.75**3] * 3, rel=1e-14)]
 
 
 def test_a_transparent_interval_counts_for_the_table_and_nothing_else(device: str) -> None:

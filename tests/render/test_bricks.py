@@ -115,6 +115,18 @@ def test_bricks_are_kept_until_volume_or_opacities_change() -> None:
     assert bricks.bricks_of(grid, stencil, peak(0.5, 0.6)) is None
 
 
+def test_bricks_are_those_of_the_type_that_samples_have() -> None:
+    """What rounding may add is less in float64: a control point just above the samples leaves them empty there only."""
+    stencil = ops.Stencil.jet((bspline(2),) * 3, 0)
+    edge = float(torch.tensor(0.1) * (1 + 8 * torch.finfo(torch.float32).eps))
+    exact = TransferFunction(torch.tensor([edge, 0.5]).double(), [[1.0] * 3] * 2, [0.0, 0.5])
+    for order in ((torch.float32, torch.float64), (torch.float64, torch.float32)):
+        grid = torch.full((9, 9, 9), 0.1)
+        found = {dtype: bricks.bricks_of(grid, stencil, exact.to(dtype)) for dtype in order}
+        assert found[torch.float32] is None
+        assert found[torch.float64] is not None
+
+
 def test_ranges_of_integers_halves_and_nan() -> None:
     grid = torch.randn(8, 8, 8) * 50
     for stored in (torch.uint8, torch.int16, torch.float16, torch.bfloat16):

@@ -257,9 +257,12 @@ def test_a_zoomed_view_is_a_magnified_crop():
 
 
 @pytest.mark.parametrize("termination", [0.3, 0.05, 1e-3])
-@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 3.0, 0.0)])
-def test_termination_changes_the_image_by_no_more_than_it_says(termination, background):
-    bright = TransferFunction(PEAKS.positions, 1.5 * PEAKS.colors, PEAKS.opacities, unit=0.05)
+@pytest.mark.parametrize(
+    ("glow", "background"), [(1.5, (0.0, 0.0, 0.0)), (1.5, (1.0, 30.0, 0.0)), (0.05, (0.0, 0.0, 0.0))]
+)
+def test_termination_changes_the_image_by_no_more_than_it_says(termination, glow, background):
+    """Of any component: lit colours, what shines through from behind, and opacity."""
+    bright = TransferFunction(PEAKS.positions, glow * PEAKS.colors, PEAKS.opacities, unit=0.05)
     scene = {"size": (24, 18), "shading": LIT, "background": background, "dtype": torch.float64}
     field = Counting(MARSCHNER_LOBB)
     full = render(field, camera_for(field), bright, **scene)

@@ -460,6 +460,35 @@ def test_derivatives_at_a_control_point_are_those_to_its_right(monkeypatch: pyte
         torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
 
 
+CONTROL_POINTS = {
+    "even": [0.0, 0.25, 0.5, 0.75, 1.0],
+    "compared": [-0.5, 0.25, 0.5, 1.0],
+    "bucketed": [k * (k + 1) / 512 for k in range(20)],
+}
+"""Numbers that float32 has, found in each of the ways of `ops.cpu.optics.WAYS`."""
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scheme", ["direct", "fused"])
+@pytest.mark.parametrize("way", CONTROL_POINTS)
+def test_the_slope_at_every_control_point_is_that_to_its_right(way: str, scheme: str, dtype: torch.dtype) -> None:
+    """At the last one it is that to its left. A slice for each: its rays meet that value alone, over 4 voxels."""
+    x = torch.tensor(CONTROL_POINTS[way], dtype=dtype)
+    alpha = torch.rand(len(x), generator=torch.Generator().manual_seed(4), dtype=torch.float64).to(dtype) / 2
+    assert driver._way_to_intervals(march.Transfer(x, x.new_zeros(len(x), 3), alpha, 2.0).steps) == way
+    volume = x[:, None, None].expand(-1, 2, 4).clone().requires_grad_()
+    origins = torch.tensor([[-5.0, 0.5, k] for k in range(len(x))]).double()
+    rays = origins, torch.tensor([[1.0, 0.0, 0.0]]).double().expand_as(origins)
+    transfer = TransferFunction(x, [[1.0, 1.0, 1.0]] * len(x), alpha, 2.0)
+    image = render(reconstruct(volume, "trilinear", scheme=scheme), rays, transfer, step=1.0, dtype=dtype)
+    (found,) = torch.autograd.grad(image[:, 3].sum(), volume)
+    exact = alpha.double()
+    right = exact.diff() / x.double().diff()
+    expected = 2 * (1 - exact) * torch.cat((right, right[-1:]))  # of 1 − (1 − α)²
+    limit = 100 * torch.finfo(dtype).eps * float(expected.abs().max())
+    torch.testing.assert_close(found.sum((1, 2)).double(), expected, rtol=0, atol=limit)
+
+
 def test_derivatives_of_a_single_control_point(monkeypatch: pytest.MonkeyPatch) -> None:
     p = scene_parameters()
     p |= {name: parameter(p[name].detach()[:1]) for name in ("positions", "colors", "opacities")}

@@ -1,0 +1,132 @@
+"""How it is seen: camera, lights, and the part that is shown."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from filterlab.fields.base import Domain
+from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
+from filterlab.render.rays import check_region
+from filterlab.render.shading import Light, Shading
+from filterlab.scenes.model.colors import Color
+from filterlab.scenes.model.quantities import Component, Positive, Section, Told, Vector
+
+
+class CameraView(Section):
+    """Where the camera is: at a pose, or looking along a direction from where the whole domain is in view."""
+
+    examples = (
+        "{direction: [-0.6, 0.75, -0.5], up: [0, 0, 1], field_of_view: 30, margin: 1.05, window: [0.1, 0.1, 0.9, 0.9]}",
+        "{projection: orthographic, position: [64, -300, 64], target: [64, 64, 64], height: 150}",
+    )
+
+    projection: Literal["perspective", "orthographic"] = "perspective"
+    """How it sees."""
+    direction: Annotated[Vector, Told(unit="world, any length")] | None = None
+    """In which it looks; the rest is framing. Left out, along y."""
+    position: Annotated[Vector, Told(unit="world")] | None = None
+    """Where it is, instead of a direction; with a `target`."""
+    target: Annotated[Vector, Told(unit="world")] | None = None
+    """What is in the middle of the whole image plane; with a `position`."""
+    up: Annotated[Vector, Told(unit="world, any length")] = (0.0, 0.0, 1.0)
+    """What is up in the picture."""
+    field_of_view: Annotated[float, Told("a number between 0 and 180", "degrees")] = 30.0
+    """Vertical angle of a perspective view."""
+    height: Annotated[Positive, Told(unit="world length")] | None = None
+    """Of the image plane of an orthographic view with a position."""
+    margin: Annotated[float, Told("a number ≥ 1")] = 1.05
+    """Of framing: the domain fills 1/margin of the picture."""
+    window: Annotated[Window, Told("[left, top, right, bottom] in 0 … 1", "parts of the image plane")] = WHOLE
+    """The part of the image plane that is shown, magnified."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> CameraView:
+        if (self.position is None) != (self.target is None):
+            raise ValueError("expected position and target together; got one of them")
+        if self.position is not None and self.direction is not None:
+            raise ValueError("expected either a direction or position and target; got both")
+        with_height = self.projection == "orthographic" and self.position is not None
+        if with_height != (self.height is not None):
+            raise ValueError("height goes with an orthographic view of a given position and target, and only with that")
+        self.build(Domain((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), (1, 1))
+        return self
+
+    def build(self, domain: Domain, size: tuple[int, int]) -> Camera:
+        """The camera, for an image of that size."""
+        if self.position is not None and self.target is not None:
+            pose = {"position": self.position, "target": self.target, "up": self.up, "window": self.window}
+            if self.projection == "perspective":
+                return PerspectiveCamera(**pose, field_of_view=self.field_of_view)
+            assert self.height is not None
+            return OrthographicCamera(**pose, height=self.height)
+        check_window(self.window)
+        left, top, right, bottom = self.window
+        aspect = size[0] * (bottom - top) / (size[1] * (right - left))
+        framing = {"up": self.up, "aspect": aspect, "margin": self.margin, "window": self.window}
+        direction = self.direction or (0.0, 1.0, 0.0)
+        if self.projection == "perspective":
+            return PerspectiveCamera.framing(domain, direction, field_of_view=self.field_of_view, **framing)
+        return OrthographicCamera.framing(domain, direction, **framing)
+
+
+class LightSource(Section):
+    """A light infinitely far away."""
+
+    examples = ("{direction: [-0.2, -1, 0.8], color: lightyellow}",)
+
+    direction: Annotated[Vector, Told(unit="world, any length")] | None = None
+    """*To* the light; left out, it is a headlight, which shines along the ray."""
+    color: Color = (1.0, 1.0, 1.0)
+    """Of its light; numbers above 1 are brighter."""
+
+    @model_validator(mode="after")
+    def _valid(self) -> LightSource:
+        Light(self.direction, self.color)
+        return self
+
+
+class Lighting(Section):
+    """Blinn-Phong shading of a medium, two-sided; of a surface the lights alone, its material has the weights."""
+
+    examples = (
+        "{lights: [{direction: [-0.2, -1, 0.8]}, {color: [0.3, 0.3, 0.3]}], ambient: 0.2, diffuse: 0.7, specular: 0.3,"
+        " shininess: 32}",
+    )
+
+    lights: tuple[LightSource, ...] = (LightSource(),)
+    """All of them; left out, one white headlight."""
+    ambient: Component = 0.2
+    """Weight of light from everywhere."""
+    diffuse: Component = 0.7
+    """Weight of the lights on a matt surface."""
+    specular: Component = 0.3
+    """Weight of their highlights."""
+    shininess: Annotated[float, Field(ge=1)] = 32.0
+    """Exponent of the highlights: the higher, the smaller."""
+
+    def build(self) -> Shading:
+        """The shading."""
+        lights = tuple(Light(light.direction, light.color) for light in self.lights)
+        return Shading(lights, self.ambient, self.diffuse, self.specular, self.shininess)
+
+
+class Region(Section):
+    """A world-space box outside of which nothing is seen."""
+
+    examples = ("{lower: [0, 0, 0], upper: [100, 100, 50]}",)
+
+    lower: Annotated[Vector, Told(unit="world")]
+    """Its corner with the least x, y, z."""
+    upper: Annotated[Vector, Told(unit="world")]
+    """Its corner with the largest."""
+
+    @model_validator(mode="after")
+    def _valid(self) -> Region:
+        check_region(self.build())
+        return self
+
+    def build(self) -> tuple[Vector, Vector]:
+        """(lower, upper)."""
+        return self.lower, self.upper
