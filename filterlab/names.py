@@ -29,10 +29,13 @@ def methods() -> tuple[str, ...]:
     return METHODS if loaded is None else tuple(loaded.METHODS)
 
 
-def unknown_name(what: str, name: object, known: Iterable[str]) -> str:
-    """The message for a name that nobody knows: "unknown method 'noch'; did you mean 'notch'? known methods: …"."""
+def unknown_name(what: str, name: object, known: Iterable[str], alike: float = 0.5) -> str:
+    """The message for a name that nobody knows: "unknown method 'noch'; did you mean 'notch'? known methods: …".
+
+    `alike` is how similar a name has to be for that, 0 … 1, as difflib measures it.
+    """
     known = [str(k) for k in known]
-    close = difflib.get_close_matches(str(name).lower(), known, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(str(name).lower(), known, n=1, cutoff=alike)
     hint = f"did you mean {close[0]!r}? " if close else ""
     return f"unknown {what} {shown(name)}; {hint}known {what}s: {', '.join(known) or '(none)'}"
 

@@ -77,7 +77,8 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_line_that_makes_no_sense(capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.nrrd"
-    fails(capsys, ["rendr"], 2, "render, mesh, scene, sdf, resample, recommend")
+    known = "render, mesh, scene, sdf, resample, convert, recommend, methods, info"
+    fails(capsys, ["rendr"], 2, f"unknown command 'rendr'; did you mean 'render'? known commands: {known}")
     fails(capsys, ["resample", volume_file], 2, "--output")
     fails(capsys, ["resample", volume_file, "-o", out], 2, "one of --spacing, --shape and --like; got none")
     fails(capsys, ["resample", volume_file, "-o", out, "--spacing", "1", "1"], 2, "--spacing")
@@ -120,6 +121,15 @@ assert "torch" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_convert_does_not_wait_for_torch_to_refuse(tmp_path: Path) -> None:
+    np.save(tmp_path / "in.npy", np.zeros((2, 3, 4)))
+    lines = [["out.tif"], ["out.npz", "--dtype", "uint9"], ["out.npz", "--frame", "3"], ["no/out.npz"]]
+    lines = [["convert", str(tmp_path / "in.npy"), str(tmp_path / out), *more] for out, *more in lines]
+    code = f"import sys; from filterlab.cli import main; print([main(a) for a in {lines}], 'torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[1, 1, 1, 1] False\n"
 
 
 def test_split_overrides() -> None:
@@ -313,9 +323,9 @@ def test_what_is_odd_about_a_file_is_told_in_a_line(
     capsys: pytest.CaptureFixture[str], series_file: Path, tmp_path: Path
 ) -> None:
     series_file.write_bytes(series_file.read_bytes() + b"more")
-    resampled = ["resample", str(series_file), "-o", "out.npy", "--quiet", "--shape", *"222"]
+    resampled = ["resample", str(series_file), "-o", "out.nii", "--quiet", "--shape", *"222"]
     for command in (["info", str(series_file)], resampled):
-        command = [str(tmp_path / a) if a == "out.npy" else a for a in command]
+        command = [str(tmp_path / a) if a == "out.nii" else a for a in command]
         assert main([*command, "--frame", "0", "--channel", "0"]) == 0
         told = f"filterlab: {series_file}: passed over what comes behind its 1440 bytes of samples\n"
         assert capsys.readouterr().err == told
@@ -405,7 +415,7 @@ def test_resample_tells_what_nifti_1_rounds(
     assert np.array_equal(load_volume(out).affine, exact)
     capsys.readouterr()
     assert main([*line, "0.5", "0.5", "0.5", "-q"]) == 0  # exact in float32
-    assert capsys.readouterr().err == ""
+    assert "rounded" not in capsys.readouterr().err
     assert main(["resample", str(volume_file), "-o", str(tmp_path / "a.nrrd"), "--shape", *"345", "--nifti2"]) == 1
     assert "for NIfTI-2; got NRRD" in capsys.readouterr().err
 

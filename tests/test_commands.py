@@ -20,6 +20,7 @@ from filterlab.world import World
 GRID = r"5 × 4 × 3 voxels of 1 × 2 × 3 mm, float32"
 WRITERS: dict[str, tuple[str, list[str], str]] = {
     "resample": ("out.nii", ["{in}", "--spacing", "1", "2", "3"], GRID),
+    "convert": ("out.npz", ["{in}"], "5 × 4 × 3 voxels of 1 × 2 × 3, float32"),
     "sdf": (
         "out.nrrd",
         ["{ply}", "--shape", "11", "10", "9"],
@@ -44,7 +45,8 @@ def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[
 
     def made(command: str, *more: str) -> list[str]:
         output, arguments, _ = WRITERS[command]
-        return [command, *(given.get(a, a) for a in arguments), "-o", str(tmp_path / output), *more]
+        option = [] if command == "convert" else ["-o"]
+        return [command, *(given.get(a, a) for a in arguments), *option, str(tmp_path / output), *more]
 
     return made
 
@@ -183,6 +185,7 @@ def test_every_command_shows_its_work(
 
 EXPECTED = {
     "resample": {"reading", "resampling", "writing"},
+    "convert": {"reading", "writing"},
     "sdf": {"measuring", "writing"},
     "mesh": {"reading", "meshing"},
     "render": {"reading", "rendering"},

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Union
 import tyro
 from tyro.conf import subcommand
 
+from filterlab.cli.convert import Convert
 from filterlab.cli.info import Info
 from filterlab.cli.mesh import Mesh
 from filterlab.cli.methods import Methods
@@ -26,8 +27,9 @@ from filterlab.cli.scenes import split_overrides
 from filterlab.cli.sdf import Sdf
 from filterlab.cli.terminal import tell
 from filterlab.io.warned import VolumeFileWarning
+from filterlab.names import unknown_name
 
-DESCRIPTION = """Reconstruction filters for sampled volumes: look at scans, resample them, compare methods.
+DESCRIPTION = """Reconstruction filters for sampled volumes: look at scans, resample and convert them, compare methods.
 
 filterlab COMMAND --help tells more, with examples. filterlab --version tells the version."""
 
@@ -37,6 +39,7 @@ COMMANDS: dict[str, Any] = {
     "scene": Scene,
     "sdf": Sdf,
     "resample": Resample,
+    "convert": Convert,
     "recommend": Recommend,
     "methods": Methods,
     "info": Info,
@@ -100,6 +103,9 @@ def _warnings_told() -> Iterator[None]:
 def _parse(arguments: list[str]) -> Any:
     """The command that was asked for. tyro prints help and mistakes of usage, and exits."""
     name = arguments[0]
+    if name not in COMMANDS and not name.startswith("-"):
+        tell(unknown_name("command", name, COMMANDS))
+        raise SystemExit(USAGE)
     if name in COMMANDS:
         kind = COMMANDS[name]
         return tyro.cli(kind, prog=f"filterlab {name}", description=inspect.cleandoc(kind.__doc__), args=arguments[1:])

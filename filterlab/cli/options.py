@@ -7,12 +7,15 @@ import os
 import re
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
 from filterlab.cli.outcome import UsageError, first_line
 from filterlab.names import unknown_name
+
+if TYPE_CHECKING:
+    from filterlab.io.bounded import VolumeHeader
 
 Triple = tuple[float, float, float]
 Output = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
@@ -36,6 +39,20 @@ def check_name(what: str, name: str, known: Collection[str]) -> None:
     """Raises ValueError for a name that is not known."""
     if name not in known:
         raise ValueError(unknown_name(what, name, known))
+
+
+INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
+FLOATS = ("float32", "float64")
+
+
+def result_type(name: str, source: VolumeHeader) -> str:
+    """The type in the file that is asked for, by NumPy's name; `input` is that of the volume."""
+    check_name("dtype", name, [*FLOATS, *INTEGERS, "input"])
+    if name != "input":
+        return name
+    if source.sample_type.kind == "f":
+        return source.sample_type.name
+    return source.stored if source.stored in INTEGERS else "uint8"  # bool
 
 
 def check_device(name: str) -> None:

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from filterlab import names
 from filterlab.cli.loading import load
 from filterlab.cli.memory import as_float, check_memory, limit_in_bytes
-from filterlab.cli.options import Channel, Frame, Output, Quiet, Triple, check_name
+from filterlab.cli.options import Channel, Frame, Output, Quiet, Triple, check_name, result_type
 from filterlab.cli.outcome import UsageError
 from filterlab.cli.saving import OutputFile
 from filterlab.cli.terminal import progress_bar, tell
@@ -111,13 +111,13 @@ class Resample:
         target = None if self.like is None else describe(self.like)
         affine = self._affine(source, target)
         keeps = self.labels or self.method == "nearest"
+        stored = None if self.dtype is None and not keeps else result_type(self.dtype or "input", source)
 
         import torch
 
         from filterlab.resampling import resample
         from filterlab.volume import Volume
 
-        stored = _result_type(self.dtype or ("input" if keeps else None), source)
         working = _working_type(stored, source)
         check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)
         self._check_fill(stored)
@@ -136,8 +136,9 @@ class Resample:
                 _tell_labels(volume, source, self.input)
             asked["progress"] = lambda done: progress(done, "resampling")
             result = resample(volume, self.method, nan=self.nan, **asked, **grid)
-            output.save(_converted(result, stored), progress, stored=stored, nifti2=self.nifti2)
-        output.tell_volume(result, self.nifti2)
+            as_asked = None if stored == "float16" else stored  # which widens where a format lacks it
+            output.save(_converted(result, stored), progress, stored=as_asked, nifti2=self.nifti2)
+        output.tell_volume(result)
 
     def _check_convention(self) -> None:
         """Raises UsageError for what is said of a matrix that is not there, or that does not ask for it."""
@@ -188,21 +189,6 @@ class Resample:
         if not all(math.isfinite(s) and s > 0 for s in self.spacing):
             raise ValueError(f"expected a --spacing of positive numbers; got {self.spacing}")
         return [max(1.0, n * s / t) for n, s, t in zip(source.size, source.spacing, self.spacing, strict=True)]
-
-
-INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
-
-
-def _result_type(name: str | None, source: VolumeHeader) -> str | None:
-    """The type in the file, by NumPy's name; None: what the values need."""
-    if name is None:
-        return None
-    check_name("dtype", name, ["float32", "float64", *INTEGERS, "input"])
-    if name != "input":
-        return name
-    if source.dtype.is_floating_point:
-        return str(source.dtype).removeprefix("torch.")
-    return source.stored if source.stored in INTEGERS else "uint8"  # bool
 
 
 def _working_type(stored: str | None, source: VolumeHeader) -> torch.dtype:

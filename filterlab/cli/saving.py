@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -68,13 +68,67 @@ class OutputFile:
         with watched(lambda done: progress(done, "writing")):
             save_volume(volume, self.path, stored=stored, nifti2=nifti2)
 
-    def tell_volume(self, volume: Volume, nifti2: bool = False) -> None:
-        """Says of a volume that was saved what of it the file does not hold, and what its header says."""
+    def tell_volume(self, volume: Volume, source: VolumeHeader | None = None) -> None:
+        """Says of a volume that was saved what the file does not hold of it (and of its source's header), and what it
+        does."""
         from filterlab.io.volumes import describe
 
-        tell_rounding(volume, self.path, nifti2)
+        written = describe(self.path)
+        for changed in (*_changed(volume, written), *(_changed_type(source, written) if source else ())):
+            tell(f"{self.path}: {changed}")
+        if lost := [*_lost(volume, written), *(_lost_of_header(source, written) if source else ())]:
+            tell(f"{self.path}: not kept: {', '.join(lost)}")
         if not self.quiet:
-            self.tell(_contents(describe(self.path)))
+            self.tell(_contents(written))
+
+
+def _changed(volume: Volume, written: VolumeHeader) -> Iterator[str]:
+    """What is read back of a volume's place as something else, in sentences."""
+    before, after = volume.world, written.world
+    if (volume.affine != written.affine).any():
+        yield _rounded(volume)
+    if before.axes != after.axes and after.axes is not None:
+        declared = "nothing was declared of them" if before.space is None else f"{before.space} was declared"
+        yield f"{written.format} says that its axes are {after.axes}; {declared}"
+
+
+def _lost(volume: Volume, written: VolumeHeader) -> Iterator[str]:
+    """What is declared of a volume's place and is not in the file."""
+    before, after = volume.world, written.world
+    if before.space is not None and after.space is None:
+        yield f"axes ({before.space})"
+    if before.unit is not None and before.unit != after.unit:
+        yield f"unit ({before.unit})"
+    if before.nifti is not None and after.nifti is None:
+        place = "" if before.nifti.to_qform is None else ", which is another place"
+        yield f"codes of NIfTI (sform {before.nifti.sform}, qform {before.nifti.qform}{place})"
+
+
+def _rounded(volume: Volume) -> str:
+    from filterlab.io import nifti
+
+    return f"the affine is rounded to float32, by {nifti.rounding(volume.affine):.0e} of itself; --nifti2 keeps it"
+
+
+_KEPT = {
+    *("space", "space dimension", "space directions", "space origin", "spacings", "axis mins", "axis maxs", "kinds"),
+    *("centerings", "space units", "units", "endian", "byte skip", "line skip", "data file", "affine from", "file"),
+    *("byte order", "offset", "order", "array", "kind", "files", "scaling"),
+}
+"""Lines of headers that say where the voxels lie and how they are stored: they are kept in other words."""
+
+
+def _changed_type(source: VolumeHeader, written: VolumeHeader) -> Iterator[str]:
+    """That values are stored as another type than they were, and why, in a sentence."""
+    if "scaling" in source.fields:
+        yield f"its values are scaled, {source.fields['scaling']}, and stored as {written.stored}"
+    elif source.stored != written.stored:
+        yield f"its type is {written.stored}; {source.path} has {source.stored}"
+
+
+def _lost_of_header(source: VolumeHeader, written: VolumeHeader) -> list[str]:
+    """Names of what else a file said, and the new one does not."""
+    return [name for name, text in source.fields.items() if name not in _KEPT and written.fields.get(name) != text]
 
 
 def _contents(header: VolumeHeader) -> str:
@@ -88,15 +142,3 @@ def _contents(header: VolumeHeader) -> str:
 def _duration(seconds: float) -> str:
     minutes = int(seconds) // 60
     return f"{minutes} min {seconds - 60 * minutes:.0f} s" if minutes else f"{seconds:.1f} s"
-
-
-def tell_rounding(volume: Volume, output: Path, nifti2: bool) -> None:
-    """What is lost of the affine, where something is: NIfTI-1 holds it in float32."""
-    from filterlab.io import nifti
-    from filterlab.io.volumes import format_of
-
-    if format_of(output).name == "NIfTI" and nifti.version_for(volume, nifti2) == 1:
-        lost = nifti.rounding(volume.affine)
-        if lost > 0:
-            what = f"{output}: the affine is rounded to float32, by {lost:.0e} of itself; --nifti2 keeps it"
-            tell(what)

@@ -77,7 +77,7 @@ class Sdf:
         with progress_bar(self.quiet) as progress:
             volume = signed_distance(triangles, grid, dtype=dtype, progress=lambda done: progress(done, "measuring"))
             output.save(volume, progress, nifti2=self.nifti2)
-        output.tell_volume(volume, self.nifti2)
+        output.tell_volume(volume)
 
     def _grid(self, triangles: Triangles) -> Grid:
         from filterlab.signed_distances import Grid

@@ -71,6 +71,8 @@ _UNKNOWN_KINDS = ("", "???", "none")
 _ALIASES = {"datafile": "data file", "byteskip": "byte skip", "lineskip": "line skip", "axismins": "axis mins"}
 _ALIASES |= {"axismaxs": "axis maxs", "centers": "centerings", "blocksize": "block size"}
 
+PAIRS = "key/value pairs"
+MAX_PAIRS = 200  # characters of their keys that are told
 MAX_FIELDS = 1000
 MAX_VALUE = 4096  # characters of a value that is taken apart; 16 vectors take a third of it
 _TAKEN_APART = ("type", "dimension", "sizes", "encoding", "endian", "data file", "byte skip", "line skip", "centerings")
@@ -127,7 +129,12 @@ def _fields(path: Path, file: BinaryIO) -> dict[str, str]:
         text = line.decode("latin-1").rstrip("\r\n")
         if not text:
             return fields
-        if text.startswith("#") or ":=" in text:
+        if text.startswith("#"):
+            continue
+        if ":=" in text:  # told, not taken: no key changes what is read
+            if len(fields.get(PAIRS, "")) < MAX_PAIRS:
+                key = text.partition(":=")[0][:MAX_PAIRS]
+                fields[PAIRS] = f"{fields[PAIRS]}, {key}" if PAIRS in fields else key
             continue
         name, colon, value = text.partition(": ")
         name = _ALIASES.get(name.lower(), name.lower())

@@ -60,13 +60,14 @@ FORMATS: dict[str, VolumeFormat] = {
 }
 
 
+TYPED_WRONG = 0.8  # so similar is .nrd to .nrrd; .mgz to .npz, .vti to .vtk are not, which are formats of their own
 BATCHED = ("npy", "npz")  # formats that hold (N, C, D, H, W)
 
 
 def format_of(path: Path) -> VolumeFormat:
     """The format of a file by its ending; a folder is a TIFF stack, or a DICOM series.
 
-    Raises VolumeFileError that lists the endings.
+    Raises VolumeFileError that lists the endings, FileNotFoundError for a folder that is not there.
     """
     if path.is_dir():
         return FORMATS["ITK" if itk.is_series(path) else "TIFF"]
@@ -74,8 +75,10 @@ def format_of(path: Path) -> VolumeFormat:
     for known in FORMATS.values():
         if name.endswith(known.endings):
             return known
+    if not path.suffix and not path.exists():  # a folder, mostly
+        raise FileNotFoundError(f"{path}: expected a volume file or a folder of slices; got nothing of this name")
     endings = [e for f in FORMATS.values() for e in f.endings]
-    raise VolumeFileError(path, "a volume file", unknown_name("ending", path.suffix, endings))
+    raise VolumeFileError(path, "a volume file", unknown_name("ending", path.suffix, endings, alike=TYPED_WRONG))
 
 
 def check_saveable(path: str | os.PathLike[str], *, batched: bool = False, nifti2: bool = False) -> Path:

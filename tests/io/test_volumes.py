@@ -528,6 +528,24 @@ def test_nrrd_and_nifti_describe_the_same_place(tmp_path: Path) -> None:
     assert (load_volume(tmp_path / "b.nrrd").affine == from_nrrd.affine).all()
 
 
+OTHER_FORMATS = (
+    ".mgz .mgh .vti .vtu .hdf .h5 .czi .nd2 .lif .lsm .jpg .png .par .rec .zarr .vol .dat .stl .zip .map .fits"
+)
+TYPED_WRONG = {".nrd": ".nrrd", ".nifti": ".nii", ".tff": ".tiff", ".nhd": ".nhdr", ".dicom": ".dcm", ".np": ".npz"}
+
+
+def test_only_what_is_typed_wrong_is_guessed_at(tmp_path: Path) -> None:
+    """The ending of another format is no mistake in typing one of ours."""
+    for ending in OTHER_FORMATS.split():
+        with pytest.raises(VolumeFileError, match=rf"unknown ending '{ending}'; known endings: \.nrrd, "):
+            describe(tmp_path / f"a{ending}")
+    for ending, meant in TYPED_WRONG.items():
+        with pytest.raises(VolumeFileError, match=rf"unknown ending '{ending}'; did you mean '{meant}'\?"):
+            describe(tmp_path / f"a{ending}")
+    with pytest.raises(FileNotFoundError, match="a volume file or a folder of slices; got nothing of this name"):
+        describe(tmp_path / "slices")
+
+
 # --- refusals of what is asked ----------------------------------------------------------------------------------------
 
 
