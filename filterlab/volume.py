@@ -160,6 +160,15 @@ def _reflect_at(x: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
     return torch.where(outside, torch.minimum(r, other) + low, x), 1 - 2 * turned.to(x.dtype)
 
 
+def times_matrix(rows: Tensor, matrix: Tensor) -> Tensor:
+    """rows `(..., K)` times a matrix `(K, M)`, one product and sum after the other, in the type of the rows.
+
+    torch's own product has the digits that others allow it: bfloat16's under autocast, TF32's on a GPU.
+    """
+    first, *others = (rows[..., k, None] * row for k, row in enumerate(matrix.unbind(0)))
+    return sum(others, first)
+
+
 def _transposed(matrix: Matrix) -> Matrix:
     return tuple(zip(*matrix, strict=True))
 
@@ -257,7 +266,7 @@ class Geometry:
         """rows · matrix; for world-aligned axes one product per component, so that nothing is mixed."""
         if self.diagonal is not None:
             return rows * rows.new_tensor([row[i] for i, row in enumerate(matrix)])
-        return rows @ rows.new_tensor(matrix)
+        return times_matrix(rows, rows.new_tensor(matrix))
 
     def to_world(self, voxels: Tensor) -> Tensor:
         """Voxel coordinates `(..., 3)` to world points."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.reference.optics import Table
+from filterlab.volume import times_matrix
 
 Numbers = Sequence[float] | Tensor
 Peak = tuple[float | Tensor, float | Tensor, float | Tensor, Numbers]
@@ -74,7 +75,7 @@ class TransferFunction(Table):
         touching = (climb.detach() >= -_FOOT).to(x.dtype)
         total = shares.sum(-1, keepdim=True)
         weights = torch.where(total > 0, shares, touching + torch.finfo(x.dtype).tiny)
-        rgb = (weights / weights.sum(-1, keepdim=True)) @ colors
+        rgb = times_matrix(weights / weights.sum(-1, keepdim=True), colors)
         return cls(x, rgb, total[:, 0], unit)
 
     @property

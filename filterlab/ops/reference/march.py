@@ -21,6 +21,7 @@ from torch.utils.checkpoint import checkpoint
 from filterlab.ops.march import Chords, Lighting, March
 from filterlab.ops.reference.gather import gather as plain_gather
 from filterlab.ops.reference.optics import Table, absorbed, shade
+from filterlab.volume import times_matrix
 
 Report = Callable[[int], None]
 """Is told how many samples of the current part are done."""
@@ -155,7 +156,7 @@ class _Described:
         given = self.given
         stencil = given.stencil.up_to(order)
         value, *gradient = self.gather(given.coefficients[None, None], points[None], stencil, given.start)[0, 0]
-        return (value, torch.stack(gradient, -1) @ self._lighting.world) if gradient else (value,)
+        return (value, times_matrix(torch.stack(gradient, -1), self._lighting.world)) if gradient else (value,)
 
     def shade(self, color: Tensor, gradient: Tensor, ray: Tensor, direction: Tensor) -> Tensor:
         s = self._lighting.at(ray)
