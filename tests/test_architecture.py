@@ -34,6 +34,8 @@ FLOORS = {
     "methods": 4,
     "surfaces": 4,
     "labels": 4,
+    "resampling_rows": 3,
+    "sites": 1,
     "resampling": 5,
     "spectrum": 5,
     "costs": 5,
