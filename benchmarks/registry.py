@@ -14,6 +14,7 @@ _NAMES = (
     "derivatives",
     "peers",
     "prefilter",
+    "resample",
     "roots",
     "dvr",
     "surfaces",

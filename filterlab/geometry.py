@@ -21,6 +21,15 @@ Matrix = tuple[tuple[float, float, float], ...]
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
+def times_matrix(rows: Tensor, matrix: Tensor) -> Tensor:
+    """rows `(..., K)` times a matrix `(K, M)`, one product and sum after the other, in the type of the rows.
+
+    torch's own product has the digits that others allow it: bfloat16's under autocast, TF32's on a GPU.
+    """
+    first, *others = (rows[..., k, None] * row for k, row in enumerate(matrix.unbind(0)))
+    return sum(others, first)
+
+
 def _transposed(matrix: Matrix) -> Matrix:
     return tuple(zip(*matrix, strict=True))
 
@@ -125,7 +134,7 @@ class Geometry:
         """rows · matrix; for world-aligned axes one product per component, so that nothing is mixed."""
         if self.diagonal is not None:
             return rows * rows.new_tensor([row[i] for i, row in enumerate(matrix)])
-        return rows @ rows.new_tensor(matrix)
+        return times_matrix(rows, rows.new_tensor(matrix))
 
     def to_world(self, voxels: Tensor) -> Tensor:
         """Voxel coordinates `(..., 3)` to world points."""

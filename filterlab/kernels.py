@@ -68,7 +68,7 @@ class PiecewisePolynomial(ABC):
         basis = torch.stack(_exponential_moments(omega, self.degree))
         starts = torch.arange(self.support, dtype=torch.float64, device=omega.device) - self.support / 2
         phases = torch.exp(-1j * omega[..., None] * starts)
-        return torch.einsum("...i,ij,j...->...", phases, table.to(phases.dtype), basis)
+        return (phases[..., :, None] * table * basis.movedim(0, -1)[..., None, :]).sum((-2, -1))
 
 
 def horner(coefficients: Sequence[Tensor] | Tensor, u: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ def strongest(
 
     Args:
         samples: of any real type; each value is a label. Not differentiable.
-        resampled: R, from an indicator (float32, shaped as the samples) to the new grid.
+        resampled: R, from an indicator (bool, shaped as the samples) to float32 on the new grid.
         boundary: beyond `zeros` there is the label 0.
         progress: told what part of the labels is done.
 
@@ -43,9 +43,9 @@ def strongest(
     chosen: Tensor | None = None
     for index, label in enumerate(labels.unbind()):
         progress(index / len(labels))
-        weight = resampled((samples == label).float())
+        weight = resampled(samples == label)
         if outside and not label.any():  # what is left by all others, which are 0 out there
-            weight = 1 - resampled((samples != 0).float())
+            weight = 1 - resampled(samples != 0)
         if best is None or chosen is None:
             best, chosen = weight, label.expand(weight.shape).clone()
             continue

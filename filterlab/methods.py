@@ -194,6 +194,11 @@ class TensorProduct(Method):
         """The value as separable terms over the stored coefficients."""
         return self.terms or same_kernel(self.factor.kernel if self.factor else self.kernel)
 
+    @property
+    def separable(self) -> tuple[Term, ...]:
+        """The value as separable terms over prefiltered samples: the same, but for a kernel that is factored."""
+        return self.terms or same_kernel(self.kernel)
+
     @cached_property
     def facts(self) -> Facts:
         """What the method promises. Raises TypeError for a kernel given as a tensor: it promises nothing."""
@@ -421,6 +426,15 @@ def as_method(method: str | Method | PiecewisePolynomial) -> Method:
     return method
 
 
+def checked(method: str | Method | PiecewisePolynomial, prefilter: bool) -> Method:
+    """The method, if it has the prefilter that is asked for. Raises ValueError, and TypeError for what is no bool."""
+    if prefilter and isinstance(method, TensorKernel):
+        raise ValueError(f"the kernel {method.name} is a TensorKernel and has no prefilter; pass prefilter=False")
+    if not isinstance(prefilter, bool):
+        raise TypeError(f"prefilter must be True or False; got {prefilter!r} (from_kernel pairs a kernel with another)")
+    return as_method(method)
+
+
 def reconstruct(
     volume: Volume | Tensor,
     method: str | Method | PiecewisePolynomial = "triquadratic",
@@ -463,11 +477,7 @@ def reconstruct(
             number), integers beyond 2⁵³, a storage that can't hold the coefficients, or a fused scheme that cannot run
             here (the message says what is missing).
     """
-    if prefilter and isinstance(method, TensorKernel):
-        raise ValueError(f"the kernel {method.name} is a TensorKernel and has no prefilter; pass prefilter=False")
-    if not isinstance(prefilter, bool):
-        raise TypeError(f"prefilter must be True or False; got {prefilter!r} (from_kernel pairs a kernel with another)")
-    volume, method, boundary = as_volume(volume), as_method(method), Boundary.named(boundary)
+    volume, method, boundary = as_volume(volume), checked(method, prefilter), Boundary.named(boundary)
     scheme = scheme_named(scheme)
     method.scheme(scheme, gradient, sampler)  # refused before the samples are read
     samples, unknown = missing_values.resolved(volume.samples, nan)
@@ -503,6 +513,6 @@ def _that_runs(scheme: Scheme, coefficients: Coefficients, asked: Asked) -> Sche
 def _missing_for_fused(coefficients: Coefficients, scheme: Direct | OnTetrahedra) -> str | None:
     """What the fused sum lacks for these coefficients, or None."""
     values = coefficients.values.detach().reshape(-1, 1, *coefficients.values.shape[-3:])
-    points = torch.empty(values.shape[0], 0, 3, device=values.device)
+    points = torch.empty(values.shape[0], 0, 3, dtype=torch.float32, device=values.device)
     implementation = implementation_of("fused", values.device)
     return gather.missing(implementation, values, points, scheme.stencils[1], None, coefficients.start)

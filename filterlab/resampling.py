@@ -1,4 +1,5 @@
-"""A volume on another grid, by any method: separable where the grids are aligned and the method is, else pointwise.
+"""A volume on another grid, by any method: by rows of matrices where the grids are aligned and the method is separable,
+else point by point.
 
 The nearest sample is taken as it stands, in its own type.
 """
@@ -6,28 +7,33 @@ The nearest sample is taken as it stands, in its own type.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from filterlab import prefilters
 from filterlab.fields.base import Field
-from filterlab.fields.grid import GridField, Term
 from filterlab.kernels import PiecewisePolynomial
 from filterlab.labels import strongest
-from filterlab.methods import METHODS, Method, as_method, reconstruct
+from filterlab.methods import METHODS, Method, TensorProduct, checked, reconstruct
 from filterlab.missing_values import resolved
-from filterlab.ops.reference.gather import locate, tap_weights
+from filterlab.ops.contract import Axes, Contraction
+from filterlab.ops.differentiable.contract import contract, fused
+from filterlab.ops.differentiable.recording import plain
+from filterlab.ops.gather import STORAGE
+from filterlab.resampling_rows import reached, rows_of
+from filterlab.sites import NEARER, Part, Sites
 from filterlab.volume import Boundary, Geometry, Volume, as_volume, exact_float
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 Progress = Callable[[float], None]
-POINTS_AT_ONCE = 1 << 20
-NEARER = 1e-9  # voxels within which two coordinates are the same: what is halfway between samples, or on the box
+PARTS = 16  # in which a result is made that needs more than one number a voxel
+SMALLEST = 1 << 16  # voxels of one
 
 
 def resample(
@@ -44,7 +50,7 @@ def resample(
     nan: str = "refuse",
     labels: bool = False,
     fill: float | None = None,
-    progress: Progress = lambda part: None,
+    progress: Progress | None = None,
 ) -> Volume:
     """The volume reconstructed by a method and sampled on another grid.
 
@@ -67,9 +73,9 @@ def resample(
             the outermost centres; NaN too. Default: none, the boundary rules there.
         progress: told what part is done, 0 … 1.
 
-    Exactly one of spacing, shape and like must be given, or none with an affine. This reconstructs, it does not
-    anti-alias: when the new grid is coarser than the old one, blur first. Cost: one pass of S taps per axis; memory:
-    about two volumes of the larger size.
+    Exactly one of spacing, shape and like must be given, or none with an affine. This reconstructs, it does not anti-alias: when the new grid
+    is coarser than the old one, blur first. Cost: one pass of S taps per axis; memory: about two volumes of the larger
+    size.
 
     Returns:
         a Volume, differentiable in the samples.
@@ -78,80 +84,57 @@ def resample(
         ValueError: also for integers that the type of the computation does not hold; and where no new voxel lies in the
             old box, unless the boundary is `wrap` or there is a `fill`.
     """
-    volume, boundary = as_volume(volume), Boundary.named(boundary)
+    volume, boundary, method = as_volume(volume), Boundary.named(boundary), checked(method, prefilter)
     if affine is not None and spacing is None and shape is None and like is None:
         like = volume
     target_shape, geometry = _target(volume, spacing, shape, None if like is None else as_volume(like))
     if affine is not None:
         volume = Volume.with_geometry(volume.samples, volume.geometry.moved(affine))
-    outside = _outside(volume, target_shape, geometry) if like is not None or affine is not None else None
-    if outside is not None and fill is None and boundary is not Boundary.WRAP and bool(outside.all()):
+    sites = Sites.of(volume, target_shape, geometry)
+    elsewhere = like is not None or affine is not None
+    if elsewhere and fill is None and boundary is not Boundary.WRAP and not sites.meet_box:
         raise ValueError(
             f"expected grids that overlap; got {volume} and, with no voxel in its box, one of shape {target_shape}, "
             f"spacing {[float(f'{s:.6g}') for s in geometry.spacing]}, "
             f"origin {[float(f'{v:.6g}') for v in geometry.origin]} (or give fill)"
         )
-    if labels or as_method(method) is METHODS["nearest"]:
+    if not elsewhere:
+        fill = None
+    if labels or method is METHODS["nearest"]:
         if dtype not in (None, volume.dtype):
             raise ValueError(f"nearest samples and labels keep their type, {volume.dtype}; got dtype={dtype}")
-        take = _labelled(method, prefilter, progress) if labels else _nearest
-        complete = Volume.with_geometry(_complete(volume.samples, nan), volume.geometry)
+        samples = volume.samples if nan == "propagate" else resolved(volume.samples, nan)[0]
         _check_fill(fill, volume.dtype)
-        samples = take(complete, target_shape, geometry, boundary)
-        progress(1.0)
-        return Volume.with_geometry(_filled(samples, outside, fill), geometry)
-    needed = exact_float(volume.samples)
+        take = _nearest(samples, boundary, sites)
+        if labels:
+            take = _labelled(samples, method, boundary, prefilter, sites, progress)
+        return Volume.with_geometry(_made(take, samples, sites, volume.dtype, fill, progress), geometry)
+    dtype = _type_of_result(volume.samples, dtype)
+    working = torch.promote_types(dtype, torch.float32)
+    samples, unknown = resolved(volume.samples, nan)
+    if sites.aligned and isinstance(method, TensorProduct):
+        contraction = _contraction(method, prefilter, boundary, sites, working)
+        at_once = unknown is None and fill is None and progress is None
+        if at_once and dtype == working and fused(samples, contraction):
+            return Volume.with_geometry(contract(samples, contraction, working), geometry)
+        take = _contracted(samples, contraction, working)
+        if unknown is not None:
+            take = _with_unknown(take, unknown, _reached(method, boundary, sites))
+    else:
+        samples = samples if torch.promote_types(samples.dtype, torch.float32) == working else samples.to(working)
+        take = _pointwise(reconstruct(samples, method, boundary=boundary, prefilter=prefilter, nan=nan), sites, working)
+    return Volume.with_geometry(_made(take, samples, sites, dtype, fill, progress), geometry)
+
+
+def _type_of_result(samples: Tensor, dtype: torch.dtype | None) -> torch.dtype:
+    """Raises ValueError for a type that is none to compute in, or does not hold the samples."""
+    needed = exact_float(samples)
     dtype = dtype or needed
     if not dtype.is_floating_point:
         raise ValueError(f"dtype must be a floating type (round and clip the result for {dtype}); got {dtype}")
-    if needed == torch.float64 and dtype != needed and not volume.dtype.is_floating_point:
+    if needed == torch.float64 and dtype != needed and not samples.dtype.is_floating_point:
         raise ValueError(f"{dtype} does not hold the integers of this volume exactly; float64 does")
-    working = torch.promote_types(dtype, torch.float32)
-    field = reconstruct(
-        volume if volume.dtype == working else volume.to(working),
-        method,
-        boundary=boundary,
-        prefilter=prefilter,
-        nan=nan,
-    )
-    samples = _sampled(field, volume, target_shape, geometry, working, progress)
-    progress(1.0)
-    return Volume.with_geometry(_filled(samples.to(dtype), outside, fill), geometry)
-
-
-def _outside(volume: Volume, shape: tuple[int, int, int], geometry: Geometry) -> Tensor:
-    """Which voxel centres of another grid lie outside of a volume's box of voxels, (D, H, W)."""
-    device = volume.samples.device
-    steps = _aligned(volume.geometry, geometry)
-    if steps is not None:
-        out = torch.zeros((1, 1, 1), dtype=torch.bool, device=device)
-        for axis, (n, old) in enumerate(zip(shape[::-1], volume.size, strict=True)):
-            x = float(steps[0][axis]) * torch.arange(n, dtype=torch.float64, device=device) + float(steps[1][axis])
-            out = out | _beyond(x, old).reshape(-1, *(1 for _ in range(axis)))
-        return out.expand(shape)
-    parts = []
-    for positions in _positions(volume, shape, geometry):
-        x, y, z = (_beyond(p, n) for p, n in zip(positions, volume.size, strict=True))
-        parts.append(x | y | z)
-    return torch.cat(parts).reshape(shape)
-
-
-def _beyond(x: Tensor, n: int) -> Tensor:
-    return (x < -0.5 - NEARER) | (x > n - 0.5 + NEARER)
-
-
-def _positions(
-    volume: Volume, shape: tuple[int, int, int], geometry: Geometry
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Voxel coordinates x, y, z in a volume of the voxel centres of another grid, a million at a time."""
-    d, h, w = shape
-    device = volume.samples.device
-    matrix = torch.from_numpy(np.linalg.solve(volume.affine, geometry.affine)).to(device)
-    for begin in range(0, d * h * w, POINTS_AT_ONCE):
-        i = torch.arange(begin, min(begin + POINTS_AT_ONCE, d * h * w), device=device)
-        voxels = torch.stack((i % w, i // w % h, i // (w * h)), -1).to(torch.float64)
-        x, y, z = (voxels @ matrix[:3, :3].T + matrix[:3, 3]).unbind(-1)
-        yield x, y, z
+    return dtype
 
 
 def _check_fill(fill: float | None, dtype: torch.dtype) -> None:
@@ -161,34 +144,6 @@ def _check_fill(fill: float | None, dtype: torch.dtype) -> None:
     info = torch.iinfo(dtype)
     if fill != fill or fill in (math.inf, -math.inf) or fill != int(fill) or not info.min <= fill <= info.max:
         raise ValueError(f"expected a fill that {dtype} holds; got {fill!r}")
-
-
-def _filled(samples: Tensor, outside: Tensor | None, fill: float | None) -> Tensor:
-    return samples if outside is None or fill is None else samples.masked_fill(outside, fill)
-
-
-def _sampled(
-    field: Field,
-    volume: Volume,
-    shape: tuple[int, int, int],
-    geometry: Geometry,
-    dtype: torch.dtype,
-    progress: Progress = lambda part: None,
-) -> Tensor:
-    """The field of a volume at the voxel centres of another grid."""
-    steps = _aligned(volume.geometry, geometry)
-    if isinstance(field, GridField) and field.scheme.terms and steps is not None:
-        return _separable(field, shape, *steps, dtype)
-    return _pointwise(field, volume.samples.device, shape, geometry, dtype, progress)
-
-
-def _aligned(old: Geometry, new: Geometry) -> tuple[np.ndarray, np.ndarray] | None:
-    """(scale, start) with old voxel = scale · new voxel + start, along each axis; None: axes are mixed."""
-    steps = np.linalg.solve(old.affine, new.affine)
-    off_axis = np.abs(steps[:3, :3] - np.diag(np.diag(steps[:3, :3]))).max()
-    if off_axis > 1e-12 * np.abs(steps[:3, :3]).max():
-        return None
-    return np.diag(steps)[:3], steps[:3, 3]
 
 
 def _target(
@@ -218,97 +173,114 @@ def _target(
     return (d, h, w), Geometry.of(affine=affine, world=volume.world)
 
 
-def _separable(
-    field: GridField, shape: tuple[int, int, int], scale: np.ndarray, start: np.ndarray, dtype: torch.dtype
-) -> Tensor:
-    """Σ over the field's separable terms of one pass per axis; old voxel = scale · new voxel + start."""
-    stored = field.coefficients
-    values = stored.decoded(dtype)
-    positions = []
-    for axis, n in enumerate(shape[::-1]):
-        # float64 positions: the weights are exact however large the grid, and they are few
-        x = float(scale[axis]) * torch.arange(n, dtype=torch.float64, device=values.device) + float(start[axis])
-        positions.append(stored.boundary.fold(x, stored.size[axis], stored.tail)[0] - stored.shift)
-    total = None
-    for term in field.scheme.terms:
-        part = _along_axes(values, term, positions, stored.start)
-        total = part if total is None else total + part
-    assert total is not None
-    return total
+# --- parts ------------------------------------------------------------------------------------------------------------
+
+Take = Callable[[Part], Tensor]
+"""A part of the new grid -> its samples (..., planes, lines, W)."""
 
 
-def _along_axes(values: Tensor, term: Term, positions: list[Tensor], start: int) -> Tensor:
-    """One separable term; the axis that shrinks most goes first, so that the passes after it have less to do."""
-    axes = sorted(range(3), key=lambda a: positions[a].numel() / values.shape[-1 - a])
-    for axis in axes:
-        values = _along_axis(values, -1 - axis, positions[axis], term.kernels[axis], start)
-    return values if term.weight == 1 else term.weight * values
-
-
-def _along_axis(values: Tensor, dim: int, positions: Tensor, kernel: PiecewisePolynomial, start: int) -> Tensor:
-    """Σ_t weight_t(position) · values[first tap + t] along one axis."""
-    first, u = locate(positions, kernel.support, values.shape[dim], start)
-    total = None
-    for t, weight in tap_weights(u, (kernel, 0), kernel.support).items():
-        weight = weight.to(values.dtype).reshape(-1, *(1 for _ in range(-1 - dim)))
-        part = weight * values.index_select(dim, first + t)
-        total = part if total is None else total + part
-    assert total is not None
-    return total
-
-
-def _pointwise(
-    field: Field,
-    device: torch.device,
-    shape: tuple[int, int, int],
-    geometry: Geometry,
+def _made(
+    take: Take,
+    samples: Tensor,
+    sites: Sites,
     dtype: torch.dtype,
-    progress: Progress,
+    fill: float | None,
+    progress: Progress | None = None,
 ) -> Tensor:
-    """The field at every voxel centre of an arbitrary grid, in blocks of about a million points."""
-    d, h, w = shape
-    voxels = d * h * w
-    parts = []
-    for begin in range(0, voxels, POINTS_AT_ONCE):
-        i = torch.arange(begin, min(begin + POINTS_AT_ONCE, voxels), device=device)
-        points = geometry.to_world(torch.stack((i % w, i // w % h, i // (w * h)), -1).to(torch.float64)).to(dtype)
-        parts.append(field(points if field.channels is None else points[None]))
-        progress(min(begin + POINTS_AT_ONCE, voxels) / voxels)
-    samples = torch.cat(parts, -1)
-    return samples.reshape(*samples.shape[:-1], *shape)
+    """All parts of the result, one after the other where no derivative is asked: temporaries are those of a part."""
+    if not plain(samples):
+        return _finished(take, sites.everything, sites, dtype, fill)
+    out = samples.new_empty((*samples.shape[:-3], *sites.shape), dtype=dtype)
+    parts = list(sites.parts(max(SMALLEST, math.prod(sites.shape) // PARTS)))
+    for done, part in enumerate(parts, start=1):
+        out[(..., *part, slice(None))] = _finished(take, part, sites, dtype, fill)
+        if progress is not None:
+            progress(done / len(parts))
+    return out
+
+
+def _finished(take: Take, part: Part, sites: Sites, dtype: torch.dtype, fill: float | None) -> Tensor:
+    samples = take(part).to(dtype)
+    return samples if fill is None else samples.masked_fill(sites.outside(part), fill)
+
+
+# --- separable methods on aligned grids -------------------------------------------------------------------------------
+
+
+def _contraction(
+    method: TensorProduct, prefilter: bool, boundary: Boundary, sites: Sites, dtype: torch.dtype
+) -> Contraction:
+    """The matrices that turn samples into values at the sites."""
+    applied = method.prefilter if prefilter else prefilters.IDENTITY
+    terms = []
+    for term in method.separable:
+        rows = [rows_of(sites.along(a), n, term.kernels[a], applied, boundary, dtype) for a, n in enumerate(sites.size)]
+        terms.append((rows[0].scaled(term.weight), rows[1], rows[2]))
+    return Contraction(terms)
+
+
+def _contracted(samples: Tensor, contraction: Contraction, dtype: torch.dtype) -> Take:
+    def take(part: Part) -> Tensor:
+        own, (planes, lines) = contraction.part(*part)
+        needed = samples[..., planes, lines, :]
+        return contract(needed if needed.dtype in STORAGE else needed.to(dtype), own, dtype)
+
+    return take
+
+
+def _reached(method: TensorProduct, boundary: Boundary, sites: Sites) -> Contraction:
+    """The same with 1 for every coefficient that a kernel reaches, without prefilter."""
+    terms: list[Axes] = []
+    for term in method.separable:
+        x, y, z = (reached(sites.along(a), n, term.kernels[a], boundary) for a, n in enumerate(sites.size))
+        terms.append((x, y, z))
+    return Contraction(terms)
+
+
+def _with_unknown(take: Take, unknown: Tensor, reached: Contraction) -> Take:
+    """NaN where a kernel reaches a voxel that is unknown."""
+    number = _contracted(unknown.view(torch.uint8), reached, torch.float32)
+    return lambda part: take(part).masked_fill(number(part) > 0, torch.nan)
+
+
+# --- other methods, and turned grids ----------------------------------------------------------------------------------
+
+
+def _pointwise(field: Field, sites: Sites, dtype: torch.dtype) -> Take:
+    """A field in voxel coordinates at the sites, a few lines at a time."""
+
+    def take(part: Part) -> Tensor:
+        points = (p.to(dtype) for p in sites.points(part))
+        samples = torch.cat([field(p if field.channels is None else p[None]) for p in points], -1)
+        return samples.reshape(*samples.shape[:-1], part[0].stop - part[0].start, -1, sites.shape[2])
+
+    return take
 
 
 # --- samples as they stand --------------------------------------------------------------------------------------------
 
 
-def _complete(samples: Tensor, nan: str) -> Tensor:
-    """The samples with those that are missing filled in, or as they are where they may stay. Raises ValueError."""
-    return samples if nan == "propagate" else resolved(samples, nan)[0]
+def _nearest(samples: Tensor, boundary: Boundary, sites: Sites) -> Take:
+    """The sample nearest to every site; halfway between two of them, the later."""
 
+    def take_along_axes(part: Part) -> Tensor:
+        out = samples
+        for axis, own in ((2, part[0]), (1, part[1]), (0, slice(None))):
+            index, inside = _chosen(sites.along(axis)[own].to(samples.device), sites.size[axis], boundary)
+            out = out.index_select(-1 - axis, index)
+            if not inside.all():
+                out = out.masked_fill(~inside.reshape(-1, *(1 for _ in range(axis))), 0)
+        return out
 
-def _nearest(volume: Volume, shape: tuple[int, int, int], geometry: Geometry, boundary: Boundary) -> Tensor:
-    """The sample nearest to every voxel centre of another grid; halfway between two of them, the later."""
-    steps = _aligned(volume.geometry, geometry)
-    if steps is not None:
-        return _nearest_along_axes(volume, shape, steps, boundary)
-    parts = []
-    for positions in _positions(volume, shape, geometry):
-        found = [_chosen(p, n, boundary) for p, n in zip(positions, volume.size, strict=True)]
-        part = volume.samples[..., found[2][0], found[1][0], found[0][0]]
-        parts.append(part * (found[0][1] & found[1][1] & found[2][1]))
-    samples = torch.cat(parts, -1)
-    return samples.reshape(*samples.shape[:-1], *shape)
+    def take_points(part: Part) -> Tensor:
+        parts = []
+        for points in sites.points(part):
+            x, y, z = (_chosen(p, n, boundary) for p, n in zip(points.unbind(-1), sites.size, strict=True))
+            parts.append(samples[..., z[0], y[0], x[0]].masked_fill(~(x[1] & y[1] & z[1]), 0))
+        out = torch.cat(parts, -1)
+        return out.reshape(*out.shape[:-1], part[0].stop - part[0].start, -1, sites.shape[2])
 
-
-def _nearest_along_axes(
-    volume: Volume, shape: tuple[int, int, int], steps: tuple[np.ndarray, np.ndarray], boundary: Boundary
-) -> Tensor:
-    samples = volume.samples
-    for axis, n in enumerate(shape[::-1]):
-        x = float(steps[0][axis]) * torch.arange(n, dtype=torch.float64, device=samples.device) + float(steps[1][axis])
-        index, inside = _chosen(x, volume.size[axis], boundary)
-        samples = samples.index_select(-1 - axis, index) * inside.reshape(-1, *(1 for _ in range(axis)))
-    return samples
+    return take_along_axes if sites.aligned else take_points
 
 
 def _chosen(x: Tensor, n: int, boundary: Boundary) -> tuple[Tensor, Tensor]:
@@ -319,17 +291,28 @@ def _chosen(x: Tensor, n: int, boundary: Boundary) -> tuple[Tensor, Tensor]:
 
 
 def _labelled(
-    method: str | Method | PiecewisePolynomial, prefilter: bool, progress: Progress
-) -> Callable[[Volume, tuple[int, int, int], Geometry, Boundary], Tensor]:
-    """What takes, at every voxel of another grid, the label that a method finds strongest."""
+    samples: Tensor,
+    method: Method,
+    boundary: Boundary,
+    prefilter: bool,
+    sites: Sites,
+    progress: Progress | None,
+) -> Take:
+    """The label that a method finds strongest at every site."""
+    if not (sites.aligned and isinstance(method, TensorProduct)):
 
-    def labelled(volume: Volume, shape: tuple[int, int, int], geometry: Geometry, boundary: Boundary) -> Tensor:
         def resampled(indicator: Tensor) -> Tensor:
-            field = reconstruct(
-                Volume.with_geometry(indicator, volume.geometry), method, boundary=boundary, prefilter=prefilter
-            )
-            return _sampled(field, volume, shape, geometry, torch.float32)
+            field = reconstruct(indicator.float(), method, boundary=boundary, prefilter=prefilter)
+            return _made(_pointwise(field, sites, torch.float32), indicator, sites, torch.float32, None)
 
-        return strongest(volume.samples, resampled, boundary, progress)
+        whole = strongest(samples, resampled, boundary, progress or (lambda part: None))
+        return lambda part: whole[(..., *part, slice(None))]
+    contraction = _contraction(method, prefilter, boundary, sites, torch.float32)
 
-    return labelled
+    def take(part: Part) -> Tensor:
+        own, (planes, lines) = contraction.part(*part)
+        return strongest(
+            samples[..., planes, lines, :], lambda i: contract(i.view(torch.uint8), own, torch.float32), boundary
+        )
+
+    return take

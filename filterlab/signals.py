@@ -17,11 +17,12 @@ from torch import Tensor
 
 from filterlab.fields.base import Domain, Field, check_order, check_points, type_of_rays
 from filterlab.fields.crossings import Along, Bounds, crossings, stepped
+from filterlab.geometry import Geometry, times_matrix
 from filterlab.ops.pieces import Pieces
 from filterlab.ops.raycast import Candidates
 from filterlab.ops.reference import raycast
 from filterlab.ops.reference.pieces import inside
-from filterlab.volume import Geometry, Volume
+from filterlab.volume import Volume
 
 ValueAndGradient = Callable[[Tensor], tuple[Tensor, Tensor]]
 Corner = tuple[float, float, float]
@@ -100,7 +101,7 @@ class Signal(Field):
         places, matrix = (torch.tensor(x, device=origins.device, dtype=torch.float64) for x in _interpolation(n))
         t = lines.far[:, None] * places
         values = self(lines.origins[:, None] + t[..., None] * lines.directions[:, None])
-        coefficients = (values.detach() @ matrix.T).to(type_of_rays(origins, directions))
+        coefficients = times_matrix(values.detach(), matrix.T).to(type_of_rays(origins, directions))
         return Pieces(ray, lines.near, lines.far, coefficients, start)
 
     def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
@@ -413,7 +414,7 @@ def plane_wave(wave_vector: Corner = (4.0, 2.0, 1.0), phase: float = 0.0, voxel_
 
     def function(p: Tensor) -> tuple[Tensor, Tensor]:
         k = p.new_tensor(wave_vector)
-        angle = p @ k + phase
+        angle = (p * k).sum(-1) + phase
         return torch.cos(angle), -torch.sin(angle)[..., None] * k
 
     longest = math.hypot(*wave_vector)

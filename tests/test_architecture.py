@@ -36,6 +36,8 @@ FLOORS = {
     "methods": 4,
     "surfaces": 4,
     "labels": 4,
+    "resampling_rows": 3,
+    "sites": 1,
     "resampling": 5,
     "nn": 5,
     "spectrum": 5,

@@ -255,8 +255,8 @@ def _numbers(field: FieldOnTetrahedra, given: Determining, cells: Tensor, dtype:
     last = (cells.amax(0) + offsets.amax(0)).tolist() if len(cells) else [0, 0, 0]
     samples = field.samples_between(first, last).to(dtype)
     strides = torch.tensor(samples.stride()[::-1], device=cells.device)
-    out, weights = samples.new_empty(len(cells), len(weights)), weights.to(samples).T
+    out, weights = samples.new_empty(len(cells), len(weights)), weights.to(cells.device).T
     for part, own in zip(out.split(_AT_ONCE), cells.split(_AT_ONCE), strict=True):
         index = ((own - first) * strides).sum(-1)[:, None] + (offsets * strides).sum(-1)
-        part.copy_(samples.view(-1)[index] @ weights)
+        part.copy_(samples.view(-1)[index].double() @ weights)  # in float32 its digits would be others' choice
     return out

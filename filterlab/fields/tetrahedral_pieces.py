@@ -36,6 +36,7 @@ from filterlab.fields.tetrahedral import (
     primitive,
     upright,
 )
+from filterlab.geometry import times_matrix
 from filterlab.ops.differentiable import raycast as casting
 from filterlab.ops.pieces import Pieces
 from filterlab.ops.raycast import Candidates, Raycast
@@ -162,7 +163,7 @@ class FieldOnTetrahedra(GridField):
         found = []
         for normal, offset in Planes.of(self.scheme.spline).outer:
             n = lines.origins.new_tensor(normal)
-            place, speed = lines.origins @ n - offset, lines.directions @ n
+            place, speed = (lines.origins * n).sum(-1) - offset, (lines.directions * n).sum(-1)
             ends = place + speed * lines.near, place + speed * lines.far
             first, last = torch.minimum(*ends).ceil(), torch.maximum(*ends).floor()
             count = int((last - first).max()) + 1 if len(first) else 0
@@ -174,8 +175,8 @@ class FieldOnTetrahedra(GridField):
     def _inner(self, lines: Lines, line: Tensor, cells: Tensor) -> Tensor:
         """Where they pass planes through the centres of cells (P, 3), (P, M)."""
         normals = lines.origins.new_tensor(Planes.of(self.scheme.spline).inner).T
-        place = (lines.origins[line] - (cells + float(self.scheme.spline.shift))) @ normals
-        speed = (lines.directions @ normals)[line]
+        place = times_matrix(lines.origins[line] - (cells + float(self.scheme.spline.shift)), normals)
+        speed = times_matrix(lines.directions, normals)[line]
         return torch.where(speed == 0, torch.inf, -place / torch.where(speed == 0, 1, speed))
 
     def _cells(self, lines: Lines, line: Tensor, near: Tensor, far: Tensor) -> Tensor:
@@ -197,7 +198,7 @@ class FieldOnTetrahedra(GridField):
 
     def _barycentric(self, at: Located, voxels: Tensor, dtype: torch.dtype) -> Tensor:
         """(P, 4) of other points of the same tetrahedra."""
-        local = (voxels - (at.cell.T + float(self.scheme.spline.shift))).T * at.sign
+        local = (voxels - (at.cell.T.to(voxels) + float(self.scheme.spline.shift))).T * at.sign
         rows = self.evaluated.tables.barycentric  # (S, 4, 4)
         own = rows[0].expand(len(voxels), 4, 4) if at.shape is None else rows[at.shape]
         place = local.gather(0, at.axes).T

@@ -44,7 +44,8 @@ def _coefficients_of_samples(n: int, degree: int) -> Tensor:
         return torch.ones(count, 1, dtype=torch.float64)
     weights = bspline(degree)(torch.arange(-beyond, beyond + 1, dtype=torch.float64))
     order = min(ORDER, n)
-    difference = torch.tensor([(-1.0) ** (order - j) * math.comb(order, j) for j in range(order + 1)])
+    signed = [(-1.0) ** (order - j) * math.comb(order, j) for j in range(order + 1)]
+    difference = torch.tensor(signed, dtype=torch.float64)
     system = torch.zeros(count, count, dtype=torch.float64)
     for i in range(n):
         system[beyond + i, i : i + 2 * beyond + 1] = weights

@@ -99,9 +99,9 @@ def _stored_so_anyway(way: Way, fields: dict[Way, Field | None]) -> bool:
 def _points_along_rays(part: Tensor) -> Tensor:
     """Points at half a voxel from one another along rays, as a renderer or a resampler visits them."""
     generator = torch.Generator().manual_seed(0)
-    size = torch.tensor([float(n - 1) for n in reversed(part.shape)])
-    start = torch.rand(_RAYS, 1, 3, generator=generator) * size
-    direction = torch.randn(_RAYS, 1, 3, generator=generator)
+    size = torch.tensor([n - 1 for n in reversed(part.shape)], dtype=torch.float32)
+    start = torch.rand(_RAYS, 1, 3, generator=generator, dtype=torch.float32) * size
+    direction = torch.randn(_RAYS, 1, 3, generator=generator, dtype=torch.float32)
     along = 0.5 * torch.arange(_SAMPLES, dtype=torch.float32)[:, None]
     points = start + along * direction / direction.norm(dim=-1, keepdim=True)
     return points.clamp_min(0).minimum(size).reshape(-1, 3).to(part.device)

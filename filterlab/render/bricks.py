@@ -212,8 +212,16 @@ def _norm_in_space(stencil: Lowered) -> float:
         return math.inf
     total = torch.zeros(())
     for weight, x, y, z in row:
-        total = total + weight * torch.einsum("ati,buj,cvk->abctuvijk", tables[0][x], tables[1][y], tables[2][z])
+        a, b, c = (_along(axis, tables[axis][f]) for axis, f in enumerate((x, y, z)))
+        total = total + weight * (a * b * c)
     return float(_sum_of_sizes(total.flatten(-3).flatten(0, 2).flatten(1, 3)).max())
+
+
+def _along(axis: int, table: Tensor) -> Tensor:
+    """(parts, taps, coefficients) of one axis, with places for those of the other two: (a, b, c, t, u, v, i, j, k)."""
+    shape = [1] * 9
+    shape[axis::3] = table.shape
+    return table.view(shape)
 
 
 def _sum_of_sizes(coefficients: Tensor) -> Tensor:
@@ -250,4 +258,4 @@ def _bernstein(table: Sequence[Sequence[float]], parts: int) -> Tensor:
     share = torch.tensor(
         [[math.comb(k, j) / math.comb(n - 1, j) for j in range(n)] for k in range(n)], dtype=torch.float64
     )
-    return torch.einsum("jpr,kj->prk", torch.stack(shifted), share)
+    return (torch.stack(shifted, -1)[:, :, None] * share).sum(-1)

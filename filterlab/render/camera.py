@@ -278,5 +278,5 @@ def _seen_corners(
     if not _vector(direction).any():
         raise ValueError("direction must not be zero")
     right, upward, forward = _basis(torch.zeros(3, dtype=torch.float64), _vector(direction).cpu(), _vector(up).cpu())
-    x, y, z = ((corners - center) @ torch.stack((right, upward, forward), -1)).unbind(-1)
+    x, y, z = (((corners - center) * axis).sum(-1) for axis in (right, upward, forward))
     return center, x, y, z, forward

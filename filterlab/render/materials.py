@@ -216,7 +216,7 @@ class ReflectionLines(Material):
         r = seen.reflected
         axis = safe_normalize(torch.as_tensor(self.axis, dtype=r.dtype, device=r.device))
         first, second = _across(axis)
-        angle = torch.atan2(r @ second, r @ first)
+        angle = torch.atan2(dot(r, second), dot(r, first))
         stripe = 0.5 + 0.5 * torch.tanh(self.sharpness * torch.sin(self.count * angle))
         bright, dark = (torch.as_tensor(c, dtype=r.dtype, device=r.device) for c in (self.bright, self.dark))
         return torch.lerp(dark, bright, stripe[:, None])
@@ -310,7 +310,7 @@ class Toon(Material):
     def _contour(self, seen: Seen) -> Tensor:
         assert seen.curvatures is not None
         assert seen.principal is not None
-        along = (seen.principal @ seen.direction[:, :, None])[..., 0].square()  # (R, 2)
+        along = dot(seen.principal, seen.direction[:, None]).square()  # (R, 2)
         curvature = (seen.curvatures * along).sum(-1).abs() / along.sum(-1).clamp_min(1e-12)
         bent = (self.contour * curvature).clamp(max=1)
         return dot(seen.normal, seen.direction).abs() < (bent * (2 - bent)).sqrt()
@@ -342,7 +342,7 @@ def _sky(directions: Tensor) -> Tensor:
     above = torch.lerp(horizon, zenith, z.clamp_min(0).sqrt())
     sky = torch.lerp(ground, above, torch.sigmoid(40 * z))
     sun = safe_normalize(_like((0.4, -0.5, 0.75), z))
-    return sky + 3 * torch.exp(400 * (directions @ sun - 1))[:, None]
+    return sky + 3 * torch.exp(400 * (dot(directions, sun) - 1))[:, None]
 
 
 def _across(axis: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from filterlab.geometry import times_matrix
 from filterlab.io.images import from_srgb
 from filterlab.ops.reference.optics import Table
 from filterlab.render.colormaps import encoded_entries
@@ -76,7 +77,7 @@ class TransferFunction(Table):
         touching = (climb.detach() >= -_FOOT).to(x.dtype)
         total = shares.sum(-1, keepdim=True)
         weights = torch.where(total > 0, shares, touching + torch.finfo(x.dtype).tiny)
-        rgb = (weights / weights.sum(-1, keepdim=True)) @ colors
+        rgb = times_matrix(weights / weights.sum(-1, keepdim=True), colors)
         return cls(x, rgb, total[:, 0], unit)
 
     @classmethod

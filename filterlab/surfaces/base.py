@@ -441,7 +441,7 @@ def _curvatures(normal: Tensor, hessian: Tensor) -> tuple[Tensor, Tensor]:
     of ((a − c)/2, b). Where r = 0 every direction is principal; the basis is returned, with derivative 0.
     """
     first, second = _tangents(normal)
-    bend = lambda u, v: torch.einsum("...i,...ij,...j->...", u, hessian, v)  # noqa: E731
+    bend = lambda u, v: (u[..., :, None] * hessian * v[..., None, :]).sum((-2, -1))  # noqa: E731
     a, b, c = bend(first, first), bend(first, second), bend(second, second)
     middle, x = (a + c) / 2, (a - c) / 2
     square = x * x + b * b

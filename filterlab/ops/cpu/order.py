@@ -42,7 +42,7 @@ _LOOKED_AT = 2048
 def scattered(points: Tensor) -> bool:
     """Whether most points lie more than a brick from the one before: looked at in a few places."""
     count = points.shape[1]
-    at = torch.linspace(0, count - 2, min(_LOOKED_AT, count - 1)).long()
+    at = torch.linspace(0, count - 2, min(_LOOKED_AT, count - 1), dtype=torch.float64).long()
     steps = (points[:, at + 1] - points[:, at]).abs().amax(-1)
     return bool((steps > _EDGE).double().mean() > 0.5)
 

@@ -194,7 +194,9 @@ class _Program:
         sign = b.select(b.icmp_signed("<", child, I32(0)), I32(-1), I32(1))
         self.bits.value = b.bitcast(met, I8)
         with f.repeat_while(lambda: b.icmp_unsigned("!=", self.bits.value, I8(0))):
-            left = f.where(b.bitcast(self.bits.value, ir.VectorType(ir.IntType(1), WIDTH)), near, f.constant(float("-inf")))
+            left = f.where(
+                b.bitcast(self.bits.value, ir.VectorType(ir.IntType(1), WIDTH)), near, f.constant(float("-inf"))
+            )
             most = self._greatest(left)
             lanes = b.and_(b.bitcast(b.fcmp_ordered("==", left, f.everywhere(most)), I8), self.bits.value)
             lane = b.cttz(lanes, ir.IntType(1)(0))

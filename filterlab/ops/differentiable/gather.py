@@ -94,7 +94,7 @@ def pull(
 
 def gradient_to_points(raised: Tensor, cotangents: Tensor, stencil: AnyStencil) -> Tensor:
     """(N, M, 3): Σ over channels and rows of cotangent · derivative of the row."""
-    return torch.einsum("ncjm,ancjm->nma", cotangents, _along_axes(raised, stencil))
+    return torch.stack([(cotangents * row).sum((1, 2)) for row in _along_axes(raised, stencil)], -1)
 
 
 class Gather(torch.autograd.Function):
@@ -130,7 +130,8 @@ class Gather(torch.autograd.Function):
             out = gather(tangents[0], points, ctx.stencil, *ctx.rest)
         if tangents[1] is not None:
             raised = gather(coefficients, points, ctx.stencil.derivatives[0], *ctx.rest)
-            moved = torch.einsum("nma,ancjm->ncjm", tangents[1], _along_axes(raised, ctx.stencil))
+            steps = tangents[1].movedim(-1, 0)[:, :, None, None]  # (3, N, 1, 1, M)
+            moved = (steps * _along_axes(raised, ctx.stencil)).sum(0)
             out = moved if out is None else out + moved
         return out
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from filterlab.geometry import times_matrix
 from filterlab.ops.march import Chords, Lighting, March
 from filterlab.ops.reference.gather import gather as plain_gather
 from filterlab.ops.reference.optics import Table, absorbed, shade
@@ -155,7 +156,7 @@ class _Described:
         given = self.given
         stencil = given.stencil.up_to(order)
         value, *gradient = self.gather(given.coefficients[None, None], points[None], stencil, given.start)[0, 0]
-        return (value, torch.stack(gradient, -1) @ self._lighting.world) if gradient else (value,)
+        return (value, times_matrix(torch.stack(gradient, -1), self._lighting.world)) if gradient else (value,)
 
     def shade(self, color: Tensor, gradient: Tensor, ray: Tensor, direction: Tensor) -> Tensor:
         s = self._lighting.at(ray)

@@ -23,11 +23,11 @@ import torch
 from torch import Tensor
 
 from filterlab import bernstein
+from filterlab.geometry import Geometry, times_matrix
 from filterlab.kernels import PiecewisePolynomial
 from filterlab.ops.gather import extent
 from filterlab.ops.pieces import NO_MOTION, Lattice, Pieces, Triple
 from filterlab.ops.stencil import Product
-from filterlab.volume import Geometry
 
 CHUNK = 1 << 13  # pieces restricted at a time: their taps stay in the cache
 
@@ -200,7 +200,7 @@ def _product(taps: Tensor, product: Product, start: Tensor, end: Tensor) -> Tens
         own = own.narrow(3 - axis, spare, kernel.support)
         tables.append(_table(kernel, start[:, axis], end[:, axis]))
     x, y, z = tables
-    a = torch.matmul(own, x[:, None])  # (P, k, j, a)
+    a = times_matrix(own, x[:, None, None].movedim(-2, 0))  # (P, k, j, a)
     b = _contracted(a, y[:, None])  # (P, k, ·)
     return _contracted(b, z)
 
