@@ -203,7 +203,12 @@ def render_scene(scene: Scene, progress: Progress = False) -> Tensor:
 
     For its opacity as well: `build(scene).render()`.
     """
-    return build(scene).render(progress)[..., :3]
+    return picture(build(scene), progress)
+
+
+def picture(prepared: AnyPrepared, progress: Progress = False) -> Tensor:
+    """The same of a scene that is built."""
+    return prepared.render(progress)[..., :3]
 
 
 def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]]:

@@ -12,11 +12,13 @@ from filterlab.recommendation.report import duration, percent, size
 from filterlab.scenes.plan import AnyPlan, MeshPlan, Plan, SurfacePlan, ValuePlan
 
 
-def table(plan: AnyPlan | MeshPlan) -> Table:
-    """One line for every decision."""
+def table(plan: AnyPlan | MeshPlan, pictures: int = 1) -> Table:
+    """One line for every decision; of so many pictures, all of which take about what the first one does."""
     shown = Table(show_header=False, box=None)
     for name, text in _LINES[type(plan)](plan):
         shown.add_row(name, Text(text))
+    if pictures > 1:
+        shown.add_row("turntable", Text(f"{pictures} such pictures, about {duration(pictures * plan.seconds.median)}"))
     return shown
 
 
