@@ -19,6 +19,7 @@ from filterlab.io.config import dump_data, load_config, loads_config
 from filterlab.recommendation import recommend, report
 from filterlab.render.dvr import Frame, prepare
 from filterlab.render.image import Progress
+from filterlab.render.legend import Legend
 from filterlab.render.materials import Material
 from filterlab.render.raycast import raycast
 from filterlab.render.sampling import Sampling
@@ -42,6 +43,10 @@ class Prepared(Shown):
     transfer: TransferFunction
     shading: Shading | None
     sampling: Sampling
+
+    @property
+    def legend(self) -> Legend:
+        return Legend.of_transfer(self.transfer, label=self.scene.legend_label)
 
     def frame(self) -> Frame:
         """The image, ready to be marched."""
@@ -207,8 +212,9 @@ def render_scene(scene: Scene, progress: Progress = False) -> Tensor:
 
 
 def picture(prepared: AnyPrepared, progress: Progress = False) -> Tensor:
-    """The same of a scene that is built."""
-    return prepared.render(progress)[..., :3]
+    """The same of a scene that is built; with its legend, where the scene asks for one."""
+    image, asked, legend = prepared.render(progress)[..., :3], prepared.scene.legend, prepared.legend
+    return image if asked is None or legend is None else legend.beside(image, prepared.background, asked.side)
 
 
 def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]]:

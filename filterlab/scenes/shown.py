@@ -10,6 +10,7 @@ from torch import Tensor
 from filterlab.fields.base import Field
 from filterlab.render.camera import Camera
 from filterlab.render.image import Progress
+from filterlab.render.legend import Legend
 from filterlab.render.rays import Region
 from filterlab.scenes.model import Scene, Vector
 
@@ -34,6 +35,11 @@ class Shown(ABC):
     device: str
     volume_bytes: int = 0
     chosen: tuple[str, ...] = ()
+
+    @property
+    def legend(self) -> Legend | None:
+        """What stands for what values, where there is such a thing."""
+        return None
 
     @abstractmethod
     def render(self, progress: Progress = False) -> Tensor:

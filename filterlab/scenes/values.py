@@ -12,10 +12,12 @@ from torch import Tensor
 
 from filterlab.fields.base import Domain
 from filterlab.render.camera import Camera
+from filterlab.render.colormaps import ColorScale
 from filterlab.render.image import Progress
+from filterlab.render.legend import Legend
 from filterlab.render.sampling import Sampling
+from filterlab.render.transfer import TransferFunction
 from filterlab.render.values import (
-    Colors,
     Plane,
     colored,
     maximum_projection,
@@ -31,6 +33,16 @@ from filterlab.scenes.shown import Shown
 Range = Callable[[], tuple[float, float]]
 
 
+@dataclass(frozen=True)
+class TransferColors:
+    """The colours of a transfer function, whatever its opacities."""
+
+    transfer: TransferFunction
+
+    def __call__(self, value: Tensor) -> Tensor:
+        return self.transfer(value)[0]
+
+
 @dataclass(frozen=True, kw_only=True)
 class PreparedValues(Shown):
     """A picture of values.
@@ -39,7 +51,14 @@ class PreparedValues(Shown):
         colors: what a value looks like.
     """
 
-    colors: Colors
+    colors: ColorScale | TransferColors
+
+    @property
+    def legend(self) -> Legend:
+        label = self.scene.legend_label
+        if isinstance(self.colors, ColorScale):
+            return Legend.of_scale(self.colors, label=label)
+        return Legend.of_transfer(self.colors.transfer, opaque=True, label=label)
 
     @property
     @abstractmethod
@@ -134,12 +153,11 @@ def check_cut(plane: Plane, domain: Domain) -> None:
         raise ValueError(f"slice: expected a plane through the volume ({ends}); got one through {told}")
 
 
-def _colors(asked: ValueColors, shown: dict[str, Any], value_range: Range) -> Colors:
+def _colors(asked: ValueColors, shown: dict[str, Any], value_range: Range) -> ColorScale | TransferColors:
     transfer = shown["scene"].transfer
     if transfer is None:
         return asked.scale(value_range)
-    function = transfer.build(value_range, shown["field"].domain.voxel_size)
-    return lambda value: function(value)[0]
+    return TransferColors(transfer.build(value_range, shown["field"].domain.voxel_size))
 
 
 def camera_of(scene: Scene, domain: Domain) -> Camera:

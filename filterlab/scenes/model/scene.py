@@ -8,6 +8,7 @@ import torch
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from filterlab.scenes.model.colors import Color
+from filterlab.scenes.model.legend import LegendModel
 from filterlab.scenes.model.quantities import Pixels, Positive, Section, Told
 from filterlab.scenes.model.reconstruction import SceneMethod
 from filterlab.scenes.model.sources import SignalSource, VolumeFile, folder_of
@@ -41,6 +42,7 @@ camera: {direction: [-0.75, 0.65, 0.5], up: [0, 0, -1]}
 lighting: {lights: [{direction: [-0.2, -0.9, -0.9]}], ambient: 0.25, diffuse: 0.85}
 region: {lower: [0, 0, 0], upper: [255, 255, 60]}
 background: '#181c28'
+legend: {side: right, label: X-ray density}
 size: [800, 600]
 step: 0.5
 jitter: 1
@@ -82,6 +84,8 @@ slice: {axis: z, position: 31.5, colormap: bone}""",
     """Lights. Without it a medium's colours are shown as they are, and a surface has a headlight."""
     background: Color = (0.0, 0.0, 0.0)
     """Behind everything."""
+    legend: LegendModel | None = None
+    """What colours stand for what values, beside the picture; of a surface there is none."""
     region: Region | None = None
     """The part that is shown; left out, all of the volume."""
     jitter: Annotated[int, Field(ge=0, lt=2**63), Told("whole number from 0 to 2⁶³ − 1")] | None = None
@@ -122,6 +126,8 @@ slice: {axis: z, position: 31.5, colormap: bone}""",
             raise ValueError("expected either a transfer function (a medium) or a surface; got both")
         if self.transfer is None and not instead:
             raise ValueError("expected a transfer function (a medium), a surface, a mip or a slice; got none of them")
+        if self.surface is not None and self.legend is not None:
+            raise ValueError("legend: the colours of a surface stand for no values; leave it out")
         for kind in instead:
             keys, why = _WITHOUT[kind]
             if unused := [name for name in keys if getattr(self, name) is not None]:
@@ -134,6 +140,11 @@ slice: {axis: z, position: 31.5, colormap: bone}""",
     def stepped(self) -> bool:
         """Whether rays are sampled in steps."""
         return self.surface is None and self.slice is None
+
+    @property
+    def legend_label(self) -> str:
+        """Of the values in the legend."""
+        return "" if self.legend is None else self.legend.label
 
     @property
     def dtype(self) -> torch.dtype:
