@@ -73,9 +73,9 @@ def resample(
             the outermost centres; NaN too. Default: none, the boundary rules there.
         progress: told what part is done, 0 … 1.
 
-    Exactly one of spacing, shape and like must be given, or none with an affine. This reconstructs, it does not anti-alias: when the new grid
-    is coarser than the old one, blur first. Cost: one pass of S taps per axis; memory: about two volumes of the larger
-    size.
+    Exactly one of spacing, shape and like must be given, or none with an affine. This reconstructs, it does not
+    anti-alias: when the new grid is coarser than the old one, blur first. Cost: one pass of S taps per axis; memory:
+    about two volumes of the larger size.
 
     Returns:
         a Volume, differentiable in the samples.

@@ -616,7 +616,7 @@ def test_render_of_a_surface_needs_a_volume_and_a_level(
 
 def test_mistakes_about_levels_are_named(capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.png"
-    fails(capsys, ["render", volume_file, "-o", out], 1, "expected a scene", "add --level")
+    fails(capsys, ["render", volume_file, "-o", out], 1, "expected a scene", "--level, --mip or --slice z")
     fails(capsys, ["render", volume_file, "--level", "high", "-o", out], 1, "surface.level: expected a valid number")
     fails(capsys, ["render", tmp_path / "no.nrrd", "--level", "1", "-o", out], 1, "found none at")
     fails(capsys, ["render", volume_file, "--level", "1", "--step", "1", "-o", out], 1, "hit exactly")
@@ -630,7 +630,7 @@ def test_render_refuses_before_it_works(
     def never(*_: object, **__: object) -> None:
         pytest.fail("nothing must be rendered")
 
-    monkeypatch.setattr("filterlab.scenes.build.render_scene", never)
+    monkeypatch.setattr("filterlab.scenes.build.build", never)
     out = tmp_path / "a.png"
     fails(capsys, ["render", scene_file, "-o", out, "--method", "noch"], 1, "did you mean 'notch'?", "tricubic")
     fails(capsys, ["render", scene_file, "-o", out, "--camera.fov", "3"], 1, "--camera.fov: camera.fov: unknown key")
@@ -639,7 +639,7 @@ def test_render_refuses_before_it_works(
     fails(capsys, ["render", scene_file, "-o", out, "--device", "meta"], 1, "device", "'meta'")
     wave = "{name: plane-wave, samples: 8, parameters: {wave_vector: 3}}"
     fails(capsys, ["render", scene_file, "-o", out, "--signal", wave], 1, "signal.parameters: wave_vector: expected")
-    fails(capsys, ["render", scene_file, "-o", tmp_path / "a.jpg"], 1, "ends in .png")
+    fails(capsys, ["render", scene_file, "-o", tmp_path / "a.gif"], 1, "ends in .png or .jpg")
     fails(capsys, ["render", scene_file, "-o", tmp_path / "no" / "a.png"], 1, "existing folder")
     fails(capsys, ["render", tmp_path / "no.yaml", "-o", out], 1, "no.yaml")
     fails(capsys, ["render", tmp_path, "-o", out], 1, "a folder")

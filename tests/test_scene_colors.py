@@ -44,8 +44,13 @@ def test_hexadecimal_digits_are_those_of_the_file(color: str, tmp_path: Path) ->
     text = SCENE.replace("COLOR", color).replace(", opacity: 1", "" if "f'" in color else ", opacity: 1")
     path.write_text(text + "background: white\n")
     assert main(["render", str(path), "-o", str(tmp_path / "image.png")]) == 0
-    pixels = np.asarray(Image.open(tmp_path / "image.png"))
+    pixels = _digits(tmp_path / "image.png")
     assert {tuple(p) for p in pixels.reshape(-1, 3).tolist()} == {(255, 136, 0), (255, 255, 255)}
+
+
+def _digits(path: Path) -> np.ndarray:
+    with Image.open(path) as picture:
+        return np.asarray(picture)
 
 
 def test_colours_are_taken_wherever_a_scene_has_some() -> None:

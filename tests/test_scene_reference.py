@@ -29,7 +29,7 @@ def test_every_key_is_described_and_has_an_example(
     heading: str, model: type[Section], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Examples are valid sections; together they set every key."""
-    for name in ("engine.nrrd", "series.nii.gz"):
+    for name in ("engine.nrrd", "head.nii.gz", "series.nii.gz"):
         (tmp_path / name).touch()
     save_image(torch.rand(4, 8, 3), tmp_path / "sky.png")
     monkeypatch.chdir(tmp_path)

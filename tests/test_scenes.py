@@ -307,7 +307,7 @@ def test_an_environment_may_be_a_picture(scene_file, tmp_path):
     ("change", "message"),
     [
         ({"transfer": "{peaks: [{center: 1, width: 1, height: 0.5, color: [1, 1, 1]}]}"}, "got both"),
-        ({"surface": "null"}, "either a transfer function .* or a surface; got neither"),
+        ({"surface": "null"}, "a transfer function .*, a surface, a mip or a slice; got none"),
         ({"step": "0.5"}, "step: a surface is hit exactly"),
         ({"termination": "0.5"}, "termination: a surface is hit exactly"),
         ({"signal.samples": "null"}, "no exact pieces"),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -14,28 +15,39 @@ from filterlab.cli.saving import OutputFile
 from filterlab.cli.scenes import scene_asked_for
 from filterlab.cli.terminal import progress_bar, show
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from filterlab.scenes.build import AnyPrepared
+
 
 @dataclass(frozen=True)
 class Render:
-    """Make a picture of a volume or a signal, as a scene file describes it; or of the surface at a level in a volume.
+    """Make a picture of a volume or a signal, as a scene file describes it; or of a volume as it is.
 
     A scene is a YAML file: what is shown, how it is reconstructed, the transfer function or the surface, the camera,
-    the lights. Any of its values can be changed on the command line, after the name of the scene, by its path in the
-    file; --frame and --channel choose one of several volumes in a file. In place of a scene, a volume file and --level
-    are enough for a surface.
+    the lights (filterlab scene --reference). Any of its values can be changed on the command line, after the name of
+    the scene, by its path in the file; --frame and --channel choose one of several volumes in a file. In place of a
+    scene, a volume file is enough for the surface at a --level, its largest values (--mip) or a slice (--slice z).
+    --legend adds the colours and their values to the picture.
 
     examples:
       filterlab render engine.yaml -o engine.png
       filterlab render engine.yaml -o notch.png --method notch --size 512 512
-      filterlab render engine.yaml -o zoom.png --camera.window 0.4 0.4 0.6 0.6 --volume other.nrrd
+      filterlab render engine.yaml -o zoom.jpg --camera.window 0.4 0.4 0.6 0.6 --volume other.nrrd
       filterlab render engine.yaml --explain
+      filterlab render engine.yaml --turntable 36 -o spin.gif
       filterlab render engine.nrrd --level 90 -o surface.png --surface.material toon
+      filterlab render head.nii.gz --slice.axis z --slice.center 40 --slice.width 400 -o slice.png
     """
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml | VOLUME")]
-    """The scene, or a volume with --level."""
+    """The scene; or a volume with --level, --mip or --slice."""
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
-    """The picture to write: a name that ends in .png; a file of that name is replaced."""
+    """The picture to write: a name that ends in .png or .jpg (quality 95); a file of that name is replaced. With
+    --turntable .gif, .png (animated), or a folder for numbered .png files, which must be new or empty."""
+    turntable: Annotated[int | None, arg(metavar="N")] = None
+    """Make N pictures, a whole turn of the camera about what is up, through its target."""
     explain: bool = False
     """Show what the picture would take, and what the scene leaves out; no picture is made."""
     quiet: Quiet = False
@@ -45,23 +57,55 @@ class Render:
         check_asked(self.output, self.explain, ".png")
         output = None if self.output is None else self._output(self.output)
 
-        from filterlab.scenes.build import build, render_scene
+        from filterlab.scenes.build import build
+        from filterlab.scenes.turntable import check_turn, turntable
 
         scene = scene_asked_for(self.scene, overrides, self.output)
-        if output is None:
-            from filterlab.scenes.plan import plan
-            from filterlab.scenes.plan_report import table
-
-            show(table(plan(build(scene))))
-            return
-        from filterlab.io.images import save_image
-
+        if self.turntable is not None:
+            check_turn(scene, self.turntable)
         with progress_bar(self.quiet) as progress, reading(progress):
-            image = render_scene(scene, lambda done, total: progress(done / max(total, 1), "rendering"))
-        save_image(image, output.path)
-        output.tell(f"{image.shape[1]} × {image.shape[0]} pixels, 8-bit RGB")
+            prepared = build(scene)
+        views = [prepared] if self.turntable is None else turntable(prepared, self.turntable)
+        if output is not None:
+            self._write(views, output)
+            return
+        from filterlab.scenes.plan import plan
+        from filterlab.scenes.plan_report import table
+
+        show(table(plan(views[0]), pictures=len(views)))
+
+    def _write(self, views: list[AnyPrepared], output: OutputFile) -> None:
+        from filterlab.io.atomic import atomic_folder
+        from filterlab.io.images import save_animation, save_image
+        from filterlab.scenes.turntable import seconds_of_each
+
+        with progress_bar(self.quiet) as report:
+            pictures = _pictures(views, report)
+            if self.turntable is None:
+                save_image(next(pictures), output.path)
+            elif output.path.suffix:
+                save_animation(pictures, output.path, seconds=seconds_of_each(len(views)))
+            else:
+                with atomic_folder(output.path) as folder:
+                    for k, picture in enumerate(pictures):
+                        save_image(picture, folder / f"{k:0{max(3, len(str(len(views) - 1)))}d}.png")
+        width, height = views[0].scene.size
+        many = "" if self.turntable is None else f"{len(views)} pictures of "
+        output.tell(f"{many}{width} × {height} pixels, 8-bit RGB")
 
     def _output(self, output: Path) -> OutputFile:
-        if output.suffix.lower() != ".png":
-            raise ValueError(f"expected a picture's name that ends in .png; got {output}")
+        from filterlab.io.images import ANIMATIONS, PICTURES, format_of
+
+        if self.turntable is not None and not output.suffix:
+            return OutputFile.folder(output, self.scene, quiet=self.quiet)
+        format_of(output, PICTURES if self.turntable is None else ANIMATIONS)
         return OutputFile.at(output, self.scene, quiet=self.quiet)
+
+
+def _pictures(views: list[AnyPrepared], report: Callable[[float, str], None]) -> Iterator[Tensor]:
+    """The pictures of all views, one after the other."""
+    from filterlab.scenes.build import picture
+
+    for k, view in enumerate(views):
+        what = "rendering" if len(views) == 1 else f"rendering {k + 1} of {len(views)}"
+        yield picture(view, lambda done, total, k=k, what=what: report((k + done / max(total, 1)) / len(views), what))

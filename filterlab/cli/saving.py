@@ -47,6 +47,20 @@ class OutputFile:
                 check_not_input(path, source)
         return cls(path, path.exists(), began, quiet)
 
+    @classmethod
+    def folder(cls, path: Path, *sources: Path, quiet: bool = False) -> OutputFile:
+        """A folder of several files, once it is known that it is new, or empty, and can be made.
+
+        Raises OSError as `check_new_folder`.
+        """
+        from filterlab.io.atomic import check_new_folder
+
+        began = time.perf_counter()
+        check_new_folder(path)
+        for source in sources:
+            check_not_input(path, source)
+        return cls(path, False, began, quiet)
+
     def tell(self, what: str) -> None:
         """Says in one line that it stands, what is in it, and how long that took."""
         if not self.quiet:

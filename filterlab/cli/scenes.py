@@ -16,15 +16,20 @@ if TYPE_CHECKING:
 
 
 def scene_asked_for(path: Path, overrides: dict[str, str], output: Path | None) -> Scene:
-    """The scene in a file; or, with a level among the overrides, that of the surface in a volume."""
-    from filterlab.scenes.build import load_scene, surface_scene
+    """The scene in a file; or that of a volume, with a level, a mip or a slice among the overrides."""
+    from filterlab.scenes.build import load_scene, surface_scene, values_scene
 
     part = {name: overrides.pop(name) for name in ("frame", "channel") if name in overrides}
     level = overrides.pop("level", None)
-    if level is None and path.suffix.lower() not in (".yaml", ".yml", "") and path.is_file():
-        raise ValueError(f"expected a scene, a .yaml file; for the surface in a volume add --level: {path}")
     chosen = overrides | {f"volume.{name}": index for name, index in part.items()}
-    scene = load_scene(path, chosen) if level is None else surface_scene(path, level, chosen)
+    if level is not None:
+        scene = surface_scene(path, level, chosen)
+    elif path.suffix.lower() in (".yaml", ".yml", "") or not path.is_file():
+        scene = load_scene(path, chosen)
+    elif {name.partition(".")[0] for name in chosen} & {"mip", "slice"}:
+        scene = values_scene(path, chosen)
+    else:
+        raise ValueError(f"expected a scene, a .yaml file; of a volume itself, --level, --mip or --slice z: {path}")
     if scene.volume is not None and output is not None:
         check_not_input(output, Path(scene.volume.file))
     check_device(scene.device)

@@ -2,7 +2,7 @@ from .affines import CONVENTIONS, load_affine
 from .atomic import atomic_write
 from .bounded import VolumeFileError, VolumeHeader
 from .config import ConfigError, StrictModel, dump_config, load_config
-from .images import load_image, save_image
+from .images import load_image, save_animation, save_image
 from .meshes import MESH_FORMATS, load_mesh, save_mesh
 from .volumes import FORMATS, describe, load_volume, save_volume
 
@@ -22,6 +22,7 @@ __all__ = [
     "load_image",
     "load_mesh",
     "load_volume",
+    "save_animation",
     "save_image",
     "save_mesh",
     "save_volume",

@@ -6,6 +6,7 @@ import errno
 import os
 import re
 import secrets
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,20 +20,40 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
         FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError: what is wrong with the place.
     """
     path = Path(path)
+    _check_place(path)
+    if path.is_dir():
+        raise IsADirectoryError(f"cannot write {path}: expected a file name; got a folder")
+    return path
+
+
+def check_new_folder(path: str | os.PathLike[str]) -> Path:
+    """The path, once it is known that a folder can be made there; one that is empty may be there already.
+
+    Raises:
+        FileExistsError, and what `check_writable` raises: what is wrong with the place.
+    """
+    path = Path(path)
+    _check_place(path)
+    if path.exists() and not path.is_dir():
+        raise FileExistsError(f"cannot write {path}: expected a new or an empty folder; got a file")
+    if path.is_dir() and any(path.iterdir()):
+        raise FileExistsError(f"cannot write {path}: expected a new or an empty folder; got one with files in it")
+    return path
+
+
+def _check_place(path: Path) -> None:
+    """Raises OSError unless a name can be made there."""
     folder = Path(os.path.realpath(path)).parent
     if not folder.exists():
         raise FileNotFoundError(f"cannot write {path}: expected an existing folder; got {folder}, which does not exist")
     if not folder.is_dir():
         raise NotADirectoryError(f"cannot write {path}: expected a folder; got {folder}, which is a file")
-    if path.is_dir():
-        raise IsADirectoryError(f"cannot write {path}: expected a file name; got a folder")
     if not os.access(folder, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
         raise PermissionError(f"cannot write {path}: expected a writable folder; got {folder}, which is not")
     if path.exists() and not os.access(path, os.W_OK):
         raise PermissionError(
             f"cannot write {path}: expected a file that may be replaced; got one that is write-protected"
         )
-    return path
 
 
 @contextmanager
@@ -63,6 +84,24 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary folder beside `path`; renamed to `path` on success, removed with all in it on any error or Ctrl-C.
+
+    Raises:
+        OSError: as `check_new_folder` (before the block runs), or the block's own error.
+    """
+    target = Path(os.path.realpath(check_new_folder(path)))
+    temporary = target.with_name(f".tmp-{secrets.token_hex(8)}")
+    temporary.mkdir()
+    try:
+        yield temporary
+        os.replace(temporary, target)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
 def remove_temporaries(folder: str | os.PathLike[str], older: float = 0.0) -> None:
     """Removes what writers that were killed left in a folder, where nobody else is writing now.
 
@@ -72,7 +111,7 @@ def remove_temporaries(folder: str | os.PathLike[str], older: float = 0.0) -> No
     """
     for path in Path(folder).glob(".tmp-*"):
         if re.match(r"\.tmp-[0-9a-f]{16}(\.|$)", path.name) and time.time() - path.stat().st_mtime >= older:
-            path.unlink(missing_ok=True)
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def disk_is_full(error: BaseException) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
@@ -89,6 +89,19 @@ class Camera(ABC):
         v = top + (row + down) * ((bottom - top) / height)
         aspect = (width * (bottom - top)) / (height * (right - left))
         return self._rays((2 * u - 1) * aspect, 1 - 2 * v)
+
+    def turned(self, degrees: float) -> Self:
+        """This camera moved round its target about the axis along `up`, counter-clockwise seen from where that points.
+
+        position' = target + v cos φ + (k × v) sin φ + k (k·v)(1 − cos φ),   v = position − target, k = up / |up|
+
+        Source: Rodrigues, Des lois géométriques qui régissent les déplacements d'un système solide, 1840.
+        """
+        position, target, up = (_vector(v, self.device) for v in (self.position, self.target, self.up))
+        v, k = position - target, _unit(up)
+        sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+        moved = v * cosine + torch.linalg.cross(k, v) * sine + k * (k @ v) * (1 - cosine)
+        return replace(self, position=target + moved)
 
     @abstractmethod
     def _rays(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

@@ -39,13 +39,12 @@ from filterlab.render.image import (
 )
 from filterlab.render.plain import Marcher, Medium, PlainMarcher
 from filterlab.render.rays import Region, Spans, check_region, jitter, segment_count, spans
-from filterlab.render.sampling import Sampling
+from filterlab.render.sampling import MOST_SEGMENTS, Sampling
 from filterlab.render.shading import Shading
 from filterlab.render.transfer import TransferFunction
 
 _PART = 1 << 16  # rays that are cut at a time; more would only leave the caches
 _PART_OF_GPU = 1 << 20  # fewer would leave it waiting for Python
-_MOST_SEGMENTS = 2.0**62  # of a ray, that can be counted; no limit on the number of samples is as high
 _BYTES_PER_RAY = 256
 """While rays are cut and marched, roughly. Measured on a GPU, where torch counts every byte, of lit images of 2048² by
 parts of 2¹⁸ and 2²⁰ rays: 298 and 282 beyond the image. Chords are 72 of them, in the grid 48, light and depth 32."""
@@ -177,7 +176,7 @@ def prepare(
     parts = [_Part(order) for order in seen.parts(at_once)]
     if seen.count * _BYTES_PER_RAY <= sampling.memory:  # else rays are cut again for every image
         parts = [replace(part, chords=cut(seen, seen.pixels(part.order))) for part in parts]
-    total = _count(cut, seen, parts, len(media), sampling.max_samples)
+    total = sampling.check_count(_count(cut, seen, parts) * len(media))
     return Frame(media, marcher, Canvas(seen, field.channels, differentiable), cut, parts, total, color)
 
 
@@ -279,7 +278,7 @@ class Cut:
         else:
             inside = self.inside(seen, pixels)
         offset = self.offset(pixels)
-        count = segment_count(inside.length, self.step, offset).clamp_max(_MOST_SEGMENTS).long()
+        count = segment_count(inside.length, self.step, offset).clamp_max(MOST_SEGMENTS).long()
         return Chords(inside.entry, inside.direction, inside.length, offset, count)
 
     def inside(self, seen: PixelRays, pixels: Tensor) -> Spans:
@@ -297,20 +296,13 @@ class Cut:
         return float(segment_count(self.inside(seen, pixels).length, self.step, self.offset(pixels)).sum())
 
 
-def _count(cut: Cut, seen: PixelRays, parts: Sequence[_Part], images: int, limit: int) -> int:
-    """How many samples the images take. Raises ValueError above `limit`."""
+def _count(cut: Cut, seen: PixelRays, parts: Sequence[_Part]) -> float:
+    """How many samples an image takes."""
     total = 0.0
     for part in parts:
         kept = part.chords
         total += cut.count(seen, seen.pixels(part.order)) if kept is None else float(kept.count.double().sum())
-    total *= images
-    if not total <= limit:
-        more = "more than " if total >= _MOST_SEGMENTS else ""
-        raise ValueError(
-            f"the image would take {more}{total:.3g} samples; the limit is max_samples={limit:.3g}: "
-            "use a longer step, a smaller image or region, or raise max_samples"
-        )
-    return int(total)
+    return total
 
 
 def _check_arguments(

@@ -8,6 +8,9 @@ from typing import SupportsFloat, SupportsIndex
 
 import torch
 
+MOST_SEGMENTS = 2.0**62
+"""Of a ray, that can be counted; no limit on the number of samples is as high."""
+
 
 @dataclass(frozen=True)
 class Sampling:
@@ -50,6 +53,16 @@ class Sampling:
         if not length > 0:
             raise ValueError(f"step must be a world length in float64; got {self.step!r} voxels of {voxel_size:g}")
         return length
+
+    def check_count(self, total: float) -> int:
+        """That many samples of all images together. Raises ValueError above `max_samples`."""
+        if not total <= self.max_samples:
+            more = "more than " if total >= MOST_SEGMENTS else ""
+            raise ValueError(
+                f"the image would take {more}{total:.3g} samples; the limit is max_samples={self.max_samples:.3g}: "
+                "use a longer step, a smaller image or region, or raise max_samples"
+            )
+        return int(total)
 
 
 def _number(value: object) -> float:

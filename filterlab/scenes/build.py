@@ -15,43 +15,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from filterlab.fields.base import Field
 from filterlab.io.config import dump_data, load_config, loads_config
 from filterlab.recommendation import recommend, report
-from filterlab.render.camera import Camera
 from filterlab.render.dvr import Frame, prepare
 from filterlab.render.image import Progress
+from filterlab.render.legend import Legend
 from filterlab.render.materials import Material
 from filterlab.render.raycast import raycast
-from filterlab.render.rays import Region
 from filterlab.render.sampling import Sampling
 from filterlab.render.shading import Light, Shading
 from filterlab.render.transfer import TransferFunction
-from filterlab.scenes.model import Lighting, Scene, SceneMethod, SurfaceModel, Vector
+from filterlab.scenes.model import Lighting, Scene, SceneMethod, SurfaceModel
+from filterlab.scenes.shown import Shown
+from filterlab.scenes.values import PreparedProjection, PreparedSlice, camera_of, projection, sliced
 from filterlab.surfaces.level_set import LevelSet
 from filterlab.volume import Volume
-
-
-@dataclass(frozen=True, kw_only=True)
-class Shown:
-    """A scene with everything built that media and surfaces have in common.
-
-    Attributes:
-        scene: with `method: auto` replaced by what was found.
-        size: (width, height) in pixels.
-        volume_bytes: of the samples; 0 for a signal that is not sampled.
-        chosen: how `method: auto` came to its choice, in sentences; else nothing.
-    """
-
-    scene: Scene
-    field: Field
-    camera: Camera
-    size: tuple[int, int]
-    background: Vector
-    region: Region | None
-    device: str
-    volume_bytes: int = 0
-    chosen: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +43,10 @@ class Prepared(Shown):
     transfer: TransferFunction
     shading: Shading | None
     sampling: Sampling
+
+    @property
+    def legend(self) -> Legend:
+        return Legend.of_transfer(self.transfer, label=self.scene.legend_label)
 
     def frame(self) -> Frame:
         """The image, ready to be marched."""
@@ -141,6 +123,15 @@ def surface_scene(volume: str | os.PathLike[str], level: str, overrides: Mapping
     return loads_config(dump_data(content), Scene, overrides, name="--level")
 
 
+def values_scene(volume: str | os.PathLike[str], overrides: Mapping[str, str]) -> Scene:
+    """The scene of a volume file whose values are shown: the overrides have a `mip` or a `slice`.
+
+    Raises:
+        ConfigError: as `load_scene`.
+    """
+    return loads_config(dump_data({"volume": str(volume)}), Scene, overrides, name="the command line")
+
+
 _SURFACE: Mapping[str, Any] = {
     "camera": {"direction": [-0.6, 0.75, -0.5], "window": [0.12, 0.12, 0.88, 0.88]},
     "lighting": {"lights": [{"direction": [0.5, -0.6, 0.8], "color": [0.9, 0.88, 0.85]}, {"color": [0.3, 0.32, 0.36]}]},
@@ -156,7 +147,10 @@ def _number(text: str) -> float | str:
         return text
 
 
-def build(scene: Scene) -> Prepared | PreparedSurface:
+AnyPrepared = Prepared | PreparedSurface | PreparedProjection | PreparedSlice
+
+
+def build(scene: Scene) -> AnyPrepared:
     """Loads or samples what the scene shows, reconstructs it and builds camera, lights and what they fall on.
 
     Raises ValueError where `method: auto` finds nothing within its budget, with the best there is.
@@ -173,7 +167,7 @@ def build(scene: Scene) -> Prepared | PreparedSurface:
     shown: dict[str, Any] = {
         "scene": scene,
         "field": field,
-        "camera": scene.camera.build(field.domain, scene.size),
+        "camera": camera_of(scene, field.domain),
         "size": scene.size,
         "background": scene.background,
         "region": scene.region.build() if scene.region else None,
@@ -183,6 +177,10 @@ def build(scene: Scene) -> Prepared | PreparedSurface:
     }
     if scene.surface is not None:
         return _surface(scene.surface, shown, value_range)
+    if scene.mip is not None:
+        return projection(scene.mip, shown, value_range)
+    if scene.slice is not None:
+        return sliced(scene.slice, shown, value_range)
     assert scene.transfer is not None
     return Prepared(
         **shown,
@@ -210,7 +208,13 @@ def render_scene(scene: Scene, progress: Progress = False) -> Tensor:
 
     For its opacity as well: `build(scene).render()`.
     """
-    return build(scene).render(progress)[..., :3]
+    return picture(build(scene), progress)
+
+
+def picture(prepared: AnyPrepared, progress: Progress = False) -> Tensor:
+    """The same of a scene that is built; with its legend, where the scene asks for one."""
+    image, asked, legend = prepared.render(progress)[..., :3], prepared.scene.legend, prepared.legend
+    return image if asked is None or legend is None else legend.beside(image, prepared.background, asked.side)
 
 
 def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]]:
@@ -229,7 +233,7 @@ def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]
         boundary=method.boundary,
         nan=method.nan,
     )
-    step = found.pick.step if scene.step is None else scene.step
+    step = found.pick.step if scene.stepped and scene.step is None else scene.step
     return scene.model_copy(update={"method": explicit, "step": step}), tuple(report.sentences(found))
 
 

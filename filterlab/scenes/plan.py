@@ -25,8 +25,10 @@ from filterlab.ops.reference.march import segments
 from filterlab.render.dvr import Frame
 from filterlab.render.fused import FusedMarcher, empty_bricks, why_not_fused
 from filterlab.render.plain import Medium
-from filterlab.scenes.build import Prepared, PreparedSurface
+from filterlab.scenes.build import AnyPrepared, Prepared, PreparedSurface
 from filterlab.scenes.model import Scene
+from filterlab.scenes.shown import Shown
+from filterlab.scenes.values import PreparedProjection, PreparedValues, samples_of
 from filterlab.surfaces.meshes import BYTES_OF_TRIANGLE, NODE_BYTES, Grid, mesh
 
 _PROBE_RAYS = 4096
@@ -125,6 +127,41 @@ class SurfacePlan:
 
 
 @dataclass(frozen=True)
+class ValuePlan:
+    """What a picture of values takes: a maximum intensity projection, or a slice.
+
+    Attributes:
+        method, scheme, storage, taps: as in `Plan`.
+        kind: which of both.
+        rays, samples: of the whole image; of a slice one sample a ray at most.
+        step: of a projection, in voxels.
+        volume_bytes, coefficient_bytes, image_bytes, work_bytes: memory; work is what is looked at together, at most.
+        seconds: of all rays, from the median and the quartiles of a few runs of some.
+        absent, chosen: as in `Plan`.
+    """
+
+    method: str
+    scheme: str
+    storage: str
+    taps: int | None
+    kind: str
+    rays: int
+    samples: int
+    step: float | None
+    volume_bytes: int
+    coefficient_bytes: int
+    image_bytes: int
+    work_bytes: int
+    seconds: Quartiles
+    absent: tuple[str, ...]
+    chosen: tuple[str, ...] = ()
+
+    def data(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
 class MeshPlan:
     """What making triangles of the surface of a scene takes.
 
@@ -160,6 +197,9 @@ class MeshPlan:
         return asdict(self)
 
 
+AnyPlan = Plan | SurfacePlan | ValuePlan
+
+
 def plan_of_mesh(prepared: PreparedSurface, step: float) -> MeshPlan:
     """The plan of the mesh of a scene that is built; a coarser one is made, a few times."""
     surface, domain = prepared.surface, prepared.surface.domain
@@ -186,12 +226,37 @@ def plan_of_mesh(prepared: PreparedSurface, step: float) -> MeshPlan:
     )
 
 
-def plan(prepared: Prepared | PreparedSurface) -> Plan | SurfacePlan:
+def plan(prepared: AnyPrepared) -> AnyPlan:
     """The plan of a scene that is built; some of its rays are followed, the picture is not made.
 
     Takes as long as a few thousand rays do, five times over.
     """
+    if isinstance(prepared, PreparedValues):
+        return _plan_of_values(prepared)
     return _plan_of_surface(prepared) if isinstance(prepared, PreparedSurface) else _plan_of_medium(prepared)
+
+
+def _plan_of_values(prepared: PreparedValues) -> ValuePlan:
+    (width, height), scene = prepared.size, prepared.scene
+    projected = isinstance(prepared, PreparedProjection)
+    return ValuePlan(
+        **_described(prepared.field),
+        kind="maximum along every ray" if projected else "slice",
+        rays=width * height,
+        samples=samples_of(prepared) if isinstance(prepared, PreparedProjection) else width * height,
+        step=scene.step_or_default if projected else None,
+        volume_bytes=prepared.volume_bytes,
+        coefficient_bytes=coefficient_bytes(prepared.field),
+        image_bytes=width * height * 5 * scene.dtype.itemsize,
+        work_bytes=prepared.work_bytes,
+        seconds=_seconds_of_a_smaller(prepared, width * height),
+        absent=_absent_of_values(scene),
+        chosen=prepared.chosen,
+    )
+
+
+def _absent_of_values(scene: Scene) -> tuple[str, ...]:
+    return () if scene.region is not None else ("region: rays are cut to the volume only",)
 
 
 def _plan_of_surface(prepared: PreparedSurface) -> SurfacePlan:
@@ -217,15 +282,19 @@ def _plan_of_surface(prepared: PreparedSurface) -> SurfacePlan:
 
 
 def _seconds_of_surface(prepared: PreparedSurface, rays: int) -> Quartiles:
+    """Of all rays, from one for each pixel of a smaller picture."""
+    scene = prepared.scene.model_copy(
+        update={"surface": prepared.scene.surface.model_copy(update={"subpixels": 1})}  # type: ignore[union-attr]
+    )
+    return _seconds_of_a_smaller(replace(prepared, scene=scene), rays)
+
+
+def _seconds_of_a_smaller(prepared: Shown, rays: int) -> Quartiles:
     """Of all rays, from a smaller picture of the same view."""
     width, height = prepared.size
     scale = min(1.0, (_PROBE_RAYS / (width * height)) ** 0.5)
     small = max(round(width * scale), 1), max(round(height * scale), 1)
-    scene = prepared.scene.model_copy(
-        update={"surface": prepared.scene.surface.model_copy(update={"subpixels": 1})}  # type: ignore[union-attr]
-    )
-    probe = replace(prepared, size=small, scene=scene)
-    return _timed(probe.render, small[0] * small[1] / rays)
+    return _timed(replace(prepared, size=small).render, small[0] * small[1] / rays)
 
 
 def _timed(run: Callable[[], Tensor], share: float) -> Quartiles:

@@ -9,18 +9,20 @@ from rich.table import Table
 from rich.text import Text
 
 from filterlab.recommendation.report import duration, percent, size
-from filterlab.scenes.plan import MeshPlan, Plan, SurfacePlan
+from filterlab.scenes.plan import AnyPlan, MeshPlan, Plan, SurfacePlan, ValuePlan
 
 
-def table(plan: Plan | SurfacePlan | MeshPlan) -> Table:
-    """One line for every decision."""
+def table(plan: AnyPlan | MeshPlan, pictures: int = 1) -> Table:
+    """One line for every decision; of so many pictures, all of which take about what the first one does."""
     shown = Table(show_header=False, box=None)
     for name, text in _LINES[type(plan)](plan):
         shown.add_row(name, Text(text))
+    if pictures > 1:
+        shown.add_row("turntable", Text(f"{pictures} such pictures, about {duration(pictures * plan.seconds.median)}"))
     return shown
 
 
-def _begin(plan: Plan | SurfacePlan | MeshPlan) -> list[tuple[str, str]]:
+def _begin(plan: AnyPlan | MeshPlan) -> list[tuple[str, str]]:
     taps = "" if plan.taps is None else f", {plan.taps} taps"
     lines = [("method", f"{plan.method} ({plan.scheme}), coefficients as {plan.storage}{taps}")]
     return lines + [("" if i else "chosen", sentence) for i, sentence in enumerate(plan.chosen)]
@@ -53,6 +55,21 @@ def _lines(plan: Plan) -> list[tuple[str, str]]:
     return lines + _end(plan, sizes, "march")
 
 
+def _lines_of_values(plan: ValuePlan) -> list[tuple[str, str]]:
+    lines = _begin(plan)
+    lines.append(("shown", f"{plan.kind}: values alone, without light"))
+    lines.append(("rays", f"{plan.rays:,}"))
+    at = "" if plan.step is None else f" at a step of {plan.step:g} voxels"
+    lines.append(("samples", f"{plan.samples:,}{at}"))
+    sizes = (
+        ("volume", plan.volume_bytes),
+        ("coefficients", plan.coefficient_bytes),
+        ("image", plan.image_bytes),
+        ("work", plan.work_bytes),
+    )
+    return lines + _end(plan, sizes, "evaluate")
+
+
 def _lines_of_mesh(plan: MeshPlan) -> list[tuple[str, str]]:
     lines = _begin(plan)
     lines.append(("grid", " × ".join(map(str, plan.size)) + f" points, a step of {plan.step:g} voxels"))
@@ -74,7 +91,7 @@ def _memory(sizes: Sequence[tuple[str, int]]) -> tuple[str, str]:
     return "memory", ", ".join(f"{name} {size(count)}" for name, count in sizes if count)
 
 
-def _end(plan: Plan | SurfacePlan, sizes: Sequence[tuple[str, int]], verb: str) -> list[tuple[str, str]]:
+def _end(plan: AnyPlan, sizes: Sequence[tuple[str, int]], verb: str) -> list[tuple[str, str]]:
     lines = [_memory(sizes)]
     time = plan.seconds
     spread = f"{duration(time.low)} … {duration(time.high)}"
@@ -94,5 +111,6 @@ def _skipping(plan: Plan) -> str:
 _LINES: dict[type, Callable[[Any], list[tuple[str, str]]]] = {
     Plan: _lines,
     SurfacePlan: _lines_of_surface,
+    ValuePlan: _lines_of_values,
     MeshPlan: _lines_of_mesh,
 }

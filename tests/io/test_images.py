@@ -1,4 +1,4 @@
-"""PNG in and out: the sRGB curve, clipping, shapes, refusals."""
+"""Images in and out: the sRGB curve, clipping, shapes, refusals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from PIL import Image
 from skimage.color import rgb2xyz
 
 from filterlab.io import load_image, save_image
-from filterlab.io.images import from_srgb, to_srgb
+from filterlab.io.images import from_srgb, save_animation, to_srgb
 
 
 def test_the_curve_is_srgb() -> None:
@@ -64,7 +64,7 @@ def test_sixteen_bits(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("image", "name", "words"),
     [
-        (torch.zeros(2, 2, 3), "a.jpg", "ends in .png"),
+        (torch.zeros(2, 2, 3), "a.tif", "ends in .png or .jpg"),
         (torch.zeros(2, 2, 2), "a.png", "(H, W, 3)"),
         (torch.zeros(2, 2, 2, 3), "a.png", "(H, W, 3)"),
         (torch.zeros(0, 2, 3), "a.png", "not empty"),
@@ -89,3 +89,77 @@ def test_not_an_image(tmp_path: Path) -> None:
             load_image(path)
     with pytest.raises(FileNotFoundError):
         load_image(tmp_path / "b.png")
+
+
+@pytest.mark.parametrize("ending", [".jpg", ".jpeg", ".JPG"])
+def test_jpeg_is_near_its_image_in_every_colour(tmp_path: Path, ending: str) -> None:
+    """Thin coloured lines too, which subsampled colours would blur."""
+    image = torch.zeros(32, 32, 3, dtype=torch.float64)
+    image[:, ::8] = torch.tensor([1.0, 0.2, 0.05], dtype=torch.float64)
+    path = tmp_path / f"a{ending}"
+    save_image(image, path)
+    with Image.open(path) as picture:
+        assert picture.format == "JPEG"
+        assert picture.mode == "RGB"
+        difference = np.abs(np.asarray(picture).astype(float) - 255 * to_srgb(image).numpy())
+    assert difference.max() < 40
+    assert difference.mean() < 4
+
+
+def test_alpha_is_laid_over_the_background_in_linear_light(tmp_path: Path) -> None:
+    image = torch.tensor([0.8, 0.4, 0.2, 0.25], dtype=torch.float64).expand(16, 16, 4)
+    background = (0.1, 0.5, 0.9)
+    expected = to_srgb(0.25 * image[0, 0, :3] + 0.75 * torch.tensor(background, dtype=torch.float64))
+    for name, allowed in (("a.png", 0.5), ("a.jpg", 2)):
+        save_image(image, tmp_path / name, background=background)
+        with Image.open(tmp_path / name) as picture:
+            assert picture.mode == "RGB"
+            assert np.abs(np.asarray(picture) - 255 * expected.numpy()).max() <= allowed
+
+
+def _frames(count: int = 3) -> list[torch.Tensor]:
+    return [torch.full((6, 8, 3), 0.2 * k + 0.1, dtype=torch.float64) for k in range(count)]
+
+
+@pytest.mark.parametrize(("name", "allowed"), [("a.png", 0.5), ("a.gif", 4)])
+def test_an_animation_has_its_frames_and_goes_round(tmp_path: Path, name: str, allowed: float) -> None:
+    frames = _frames()
+    save_animation(iter(frames), tmp_path / name, seconds=0.25)
+    with Image.open(tmp_path / name) as picture:
+        assert picture.n_frames == 3  # type: ignore[attr-defined]
+        assert picture.info["loop"] == 0
+        for k, frame in enumerate(frames):
+            picture.seek(k)
+            assert picture.info["duration"] == 250
+            found = np.asarray(picture.convert("RGB"))
+            assert np.abs(found - 255 * to_srgb(frame).numpy()).max() <= allowed
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.gif"])
+def test_an_animation_that_is_interrupted_leaves_what_was_there(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"before")
+
+    def frames():
+        yield from _frames(2)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        save_animation(frames(), tmp_path / name, seconds=0.1)
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [(name, b"before")]
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda p: save_image(torch.zeros(2, 2, 4), p / "a.jpg"), "a JPEG has no alpha"),
+        (lambda p: save_image(torch.zeros(2, 2, 3), p / "a.png", background=(0, 0, 0)), "a background goes with alpha"),
+        (lambda p: save_image(torch.zeros(2, 2, 4), p / "a.png", background=(0, 0)), "three numbers"),
+        (lambda p: save_animation(_frames(), p / "a.jpg", seconds=1), "ends in .gif or .png"),
+        (lambda p: save_animation([], p / "a.gif", seconds=1), "frames of one size"),
+        (lambda p: save_animation([*_frames(1), torch.zeros(2, 2, 3)], p / "a.gif", seconds=1), "frames of one size"),
+    ],
+)
+def test_refusals_of_pictures(tmp_path: Path, call, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        call(tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -19,6 +19,7 @@ from filterlab.scenes.model.surface import (
     ToonModel,
 )
 from filterlab.scenes.model.transfer import ControlPoint, Peak, Transfer
+from filterlab.scenes.model.values import MipModel, SliceModel
 from filterlab.scenes.model.view import CameraView, Lighting, LightSource, Region
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "Lighting",
     "MaterialModel",
     "MethodName",
+    "MipModel",
     "Opacity",
     "Peak",
     "PhongModel",
@@ -47,6 +49,7 @@ __all__ = [
     "Section",
     "SignalModel",
     "SignalSource",
+    "SliceModel",
     "SurfaceModel",
     "ToonModel",
     "Transfer",

@@ -8,18 +8,27 @@ import torch
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from filterlab.scenes.model.colors import Color
+from filterlab.scenes.model.legend import LegendModel
 from filterlab.scenes.model.quantities import Pixels, Positive, Section, Told
 from filterlab.scenes.model.reconstruction import SceneMethod
 from filterlab.scenes.model.sources import SignalSource, VolumeFile, folder_of
 from filterlab.scenes.model.surface import SurfaceModel
 from filterlab.scenes.model.transfer import Transfer
+from filterlab.scenes.model.values import MipModel, SliceModel, ValueColors
 from filterlab.scenes.model.view import CameraView, Lighting, Region
 
 STEP = 0.5  # voxels
 
+_WITHOUT = {
+    "surface": (("step", "termination"), "a surface is hit exactly, not stepped to"),
+    "mip": (("termination", "lighting"), "a projection looks along all of a ray, without light"),
+    "slice": (("step", "jitter", "termination", "lighting"), "a slice has one value a pixel, without light"),
+}
+"""What keys have no meaning for what is shown, and why."""
+
 
 class Scene(Section):
-    """A picture of a volume or a signal: of a medium, or of a surface in it."""
+    """A picture of a volume or a signal: of a medium, of a surface in it, of its largest values, or of a slice."""
 
     examples = (
         """description: CT of an engine block, two peaks, lit
@@ -33,6 +42,7 @@ camera: {direction: [-0.75, 0.65, 0.5], up: [0, 0, -1]}
 lighting: {lights: [{direction: [-0.2, -0.9, -0.9]}], ambient: 0.25, diffuse: 0.85}
 region: {lower: [0, 0, 0], upper: [255, 255, 60]}
 background: '#181c28'
+legend: {side: right, label: X-ray density}
 size: [800, 600]
 step: 0.5
 jitter: 1
@@ -41,6 +51,11 @@ precision: float32
 device: cpu""",
         """signal: {name: marschner-lobb, samples: 40}
 surface: {level: 0.5, material: toon, subpixels: 2}""",
+        """volume: head.nii.gz
+mip: {center: 400, width: 900}
+camera: {direction: [0, 1, 0]}""",
+        """volume: head.nii.gz
+slice: {axis: z, position: 31.5, colormap: bone}""",
     )
 
     description: str = ""
@@ -55,16 +70,22 @@ surface: {level: 0.5, material: toon, subpixels: 2}""",
     """Of a medium: what its values look like."""
     surface: SurfaceModel | None = None
     """Instead of a medium: the level set that is shown."""
+    mip: MipModel | None = None
+    """Instead of a medium: the largest value along every ray."""
+    slice: SliceModel | None = None
+    """Instead of a medium: the values on a plane."""
     camera: CameraView = CameraView()
     """Where it is seen from."""
     size: Annotated[tuple[Pixels, Pixels], Told("[width, height]", "pixels")] = (512, 512)
     """Of the picture."""
     step: Annotated[Positive, Told(unit="voxels")] | None = None
-    """From sample to sample along the rays through a medium; left out, half a voxel, or what `method: auto` finds."""
+    """From sample to sample along the rays; left out, half a voxel, or what `method: auto` finds."""
     lighting: Lighting | None = None
     """Lights. Without it a medium's colours are shown as they are, and a surface has a headlight."""
     background: Color = (0.0, 0.0, 0.0)
     """Behind everything."""
+    legend: LegendModel | None = None
+    """What colours stand for what values, beside the picture; of a surface there is none."""
     region: Region | None = None
     """The part that is shown; left out, all of the volume."""
     jitter: Annotated[int, Field(ge=0, lt=2**63), Told("whole number from 0 to 2⁶³ − 1")] | None = None
@@ -89,21 +110,41 @@ surface: {level: 0.5, material: toon, subpixels: 2}""",
             raise ValueError("expected either a volume or a signal" + ("; got both" if self.volume else ""))
         if self.signal is not None and self.signal.samples is None and self.method is not None:
             raise ValueError("a signal that is not sampled needs no method: give signal.samples, or leave method out")
-        if (self.transfer is None) == (self.surface is None):
-            both = "; got both" if self.transfer else "; got neither"
-            raise ValueError(f"expected either a transfer function (a medium) or a surface{both}")
-        if self.surface is not None:
-            self._check_surface()
-        elif self.transfer is not None and self.transfer.axis == "raw":  # else the values are known with the volume
+        self._check_shown()
+        if self.surface is not None and self.signal is not None and self.signal.samples is None:
+            raise ValueError("a surface is that of samples: give signal.samples, a signal itself has no exact pieces")
+        if self.transfer is not None and self.transfer.axis == "raw":  # else the values are known with the volume
             self.transfer.build(lambda: (0.0, 1.0), 1.0).to(self.dtype)
         return self
 
-    def _check_surface(self) -> None:
-        stepped = [name for name in ("step", "termination") if getattr(self, name) is not None]
-        if stepped:
-            raise ValueError(f"{' and '.join(stepped)}: a surface is hit exactly, not stepped to; leave it out")
-        if self.signal is not None and self.signal.samples is None:
-            raise ValueError("a surface is that of samples: give signal.samples, a signal itself has no exact pieces")
+    def _check_shown(self) -> None:
+        """Raises ValueError unless one thing is shown, and every key has a meaning for it."""
+        instead = [name for name in _WITHOUT if getattr(self, name) is not None]
+        if len(instead) > 1:
+            raise ValueError(f"expected one of {', '.join(_WITHOUT)}; got {' and '.join(instead)}")
+        if self.surface is not None and self.transfer is not None:
+            raise ValueError("expected either a transfer function (a medium) or a surface; got both")
+        if self.transfer is None and not instead:
+            raise ValueError("expected a transfer function (a medium), a surface, a mip or a slice; got none of them")
+        if self.surface is not None and self.legend is not None:
+            raise ValueError("legend: the colours of a surface stand for no values; leave it out")
+        for kind in instead:
+            keys, why = _WITHOUT[kind]
+            if unused := [name for name in keys if getattr(self, name) is not None]:
+                raise ValueError(f"{' and '.join(unused)}: {why}; leave it out")
+            shown = getattr(self, kind)
+            if isinstance(shown, ValueColors) and shown.chosen and self.transfer is not None:
+                raise ValueError(f"expected the colours of a {kind} once; got a transfer function and its own")
+
+    @property
+    def stepped(self) -> bool:
+        """Whether rays are sampled in steps."""
+        return self.surface is None and self.slice is None
+
+    @property
+    def legend_label(self) -> str:
+        """Of the values in the legend."""
+        return "" if self.legend is None else self.legend.label
 
     @property
     def dtype(self) -> torch.dtype:

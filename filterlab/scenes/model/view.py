@@ -25,7 +25,7 @@ class CameraView(Section):
     projection: Literal["perspective", "orthographic"] = "perspective"
     """How it sees."""
     direction: Annotated[Vector, Told(unit="world, any length")] | None = None
-    """In which it looks; the rest is framing. Left out, along y."""
+    """In which it looks; the rest is framing. Left out, along y (along z where y is up)."""
     position: Annotated[Vector, Told(unit="world")] | None = None
     """Where it is, instead of a direction; with a `target`."""
     target: Annotated[Vector, Told(unit="world")] | None = None
@@ -61,14 +61,17 @@ class CameraView(Section):
                 return PerspectiveCamera(**pose, field_of_view=self.field_of_view)
             assert self.height is not None
             return OrthographicCamera(**pose, height=self.height)
-        check_window(self.window)
-        left, top, right, bottom = self.window
-        aspect = size[0] * (bottom - top) / (size[1] * (right - left))
-        framing = {"up": self.up, "aspect": aspect, "margin": self.margin, "window": self.window}
-        direction = self.direction or (0.0, 1.0, 0.0)
+        framing = {"up": self.up, "aspect": self.aspect(size), "margin": self.margin, "window": self.window}
+        direction = self.direction or ((0.0, 0.0, 1.0) if self.up[0] == self.up[2] == 0 else (0.0, 1.0, 0.0))
         if self.projection == "perspective":
             return PerspectiveCamera.framing(domain, direction, field_of_view=self.field_of_view, **framing)
         return OrthographicCamera.framing(domain, direction, **framing)
+
+    def aspect(self, size: tuple[int, int]) -> float:
+        """Width / height of the whole image plane, of which a picture of that size shows the window."""
+        check_window(self.window)
+        left, top, right, bottom = self.window
+        return size[0] * (bottom - top) / (size[1] * (right - left))
 
 
 class LightSource(Section):

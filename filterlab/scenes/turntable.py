@@ -1,0 +1,64 @@
+"""A scene seen from all around: the camera goes round its target, lights and field stay as they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from filterlab.render.camera import Camera, OrthographicCamera
+from filterlab.scenes.build import AnyPrepared
+from filterlab.scenes.model import Scene
+
+TURN = 4.0
+"""Seconds that a turn takes in a picture that moves."""
+_SHORTEST = 0.02
+"""Seconds for which viewers show a picture at least; shorter ones they slow down."""
+
+
+def turntable(prepared: AnyPrepared, count: int) -> list[AnyPrepared]:
+    """The views of a whole turn about the axis along `up` through the target, at equal angles, the first ahead.
+
+    The field is that of `prepared`, built once. A camera that frames the domain keeps the distance from which all of it
+    is in view all the way round: it neither comes nearer nor cuts anything off.
+
+    Raises:
+        ValueError: fewer than two views; a slice, of which nothing is seen from its side.
+    """
+    check_turn(prepared.scene, count)
+    turned = [prepared.camera.turned(360 * k / count) for k in range(count)]
+    if prepared.scene.camera.position is None:
+        turned = _at_one_distance([_framed(prepared, camera) for camera in turned])
+    return [replace(prepared, camera=camera) for camera in turned]
+
+
+def check_turn(scene: Scene, count: int) -> None:
+    """Raises ValueError as `turntable` does, before anything is built."""
+    if count < 2:
+        raise ValueError(f"expected a turntable of at least 2 pictures; got {count}")
+    if scene.slice is not None:
+        raise ValueError("a slice has no other sides: expected a medium, a surface or a mip on a turntable")
+
+
+def _framed(prepared: AnyPrepared, camera: Camera) -> Camera:
+    """The camera that looks in the same direction, as near as all of the domain can be seen from there."""
+    position, target = (torch.as_tensor(v, dtype=torch.float64) for v in (camera.position, camera.target))
+    view = prepared.scene.camera.model_copy(update={"direction": tuple((target - position).tolist())})
+    return view.build(prepared.field.domain, prepared.size)
+
+
+def _at_one_distance(cameras: list[Camera]) -> list[Camera]:
+    """All of them as far away as the farthest (or, orthographic, as wide as the widest)."""
+    heights = [float(c.height) for c in cameras if isinstance(c, OrthographicCamera)]
+    if heights:
+        return [replace(c, height=max(heights)) for c in cameras]  # type: ignore[call-arg]
+    targets = [torch.as_tensor(c.target, dtype=torch.float64) for c in cameras]
+    sights = [torch.as_tensor(c.position, dtype=torch.float64) - t for c, t in zip(cameras, targets, strict=True)]
+    farthest = max(float(sight.norm()) for sight in sights)
+    places = [t + s * (farthest / float(s.norm())) for t, s in zip(targets, sights, strict=True)]
+    return [replace(c, position=place) for c, place in zip(cameras, places, strict=True)]
+
+
+def seconds_of_each(count: int) -> float:
+    """For how long each of the pictures of a turn is shown."""
+    return max(TURN / count, _SHORTEST)
