@@ -4,7 +4,8 @@ A recursive prefilter would carry a NaN along whole lines of the volume. What ha
 becomes a field:
 
     refuse      a ValueError with the number of such voxels (the default)
-    propagate   NaN exactly where the kernel reaches such a voxel; elsewhere as with fill
+    propagate   NaN exactly where the kernel reaches such a voxel; elsewhere as with fill. There media have neither
+                colour nor opacity, and level sets end
     fill        values from the voxels around, by pull-push
 """
 

@@ -37,6 +37,7 @@ FLOORS = {
     "surfaces": 4,
     "labels": 4,
     "resampling": 5,
+    "nn": 5,
     "spectrum": 5,
     "costs": 5,
     "metrics": 5,
@@ -159,8 +160,14 @@ def test_the_floors_say_what_the_drawing_says():
     assert FLOORS["methods"] == FLOORS["surfaces"], "surfaces see fields, and never what made them"
 
 
+ORACLES = (
+    *("oracles.py", "laws.py", "ray_oracle.py", "tetrahedral_oracle.py", "tetrahedral_ray_oracle.py"),
+    "quadric_oracle.py",
+)
+
+
 def test_the_oracle_is_independent():
-    for name in ("oracles.py", "laws.py", "ray_oracle.py", "tetrahedral_oracle.py", "tetrahedral_ray_oracle.py"):
+    for name in ORACLES:
         modules = imported_modules(ROOT / "tests" / name)
         assert not [m for m in modules if m.startswith(("filterlab", "experiments"))]
 
@@ -187,6 +194,7 @@ PUBLIC = {
     "kernels",
     "load_volume",
     "metrics",
+    "nn",
     "prefilters",
     "recommend",
     "reconstruct",

@@ -96,9 +96,31 @@ def test_the_installed_command_in_its_own_process(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_help_does_not_wait_for_torch() -> None:
-    code = "import sys; from filterlab.cli import main; main(['render', '--help']); sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+def test_what_needs_no_torch_does_not_wait_for_it(volume_file: Path) -> None:
+    asked = [
+        ["--help"],
+        ["render", "--help"],
+        ["rendr"],
+        [
+            "resample",
+            str(volume_file),
+            "-o",
+            str(volume_file.with_name("o.nrrd")),
+            *["--shape", "2", "2", "2", "--method", "no"],
+        ],
+        ["recommend", str(volume_file), "--max-error", "1%", "--task", "no"],
+        ["info", str(volume_file)],
+        ["info", str(volume_file.with_name("none.nrrd"))],
+    ]
+    code = f"""
+import sys
+from filterlab.cli import main
+codes = [main(asked) for asked in {asked!r}]
+assert codes == [0, 0, 2, 1, 1, 0, 1], codes
+assert "torch" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_convert_does_not_wait_for_torch_to_refuse(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,7 +31,10 @@ from filterlab.names import unknown_name
 if TYPE_CHECKING:
     from filterlab.volume import Volume
 
-Grid: TypeAlias = "Volume | VolumeHeader"
+    Grid = Volume | VolumeHeader
+    Read = Callable[[Path], np.ndarray]
+    Lead = Callable[[np.ndarray, Grid, Grid], np.ndarray]
+
 MAX_BYTES = 2**16  # of a matrix as text
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -128,9 +131,6 @@ def _from_fsl(grid: Grid) -> np.ndarray:
         scaled[0] = -grid.spacing[0], 0.0, 0.0, grid.spacing[0] * (grid.size[0] - 1)
     return grid.affine @ np.linalg.inv(scaled)
 
-
-Read = Callable[[Path], np.ndarray]
-Lead = Callable[[np.ndarray, Grid, Grid], np.ndarray]
 
 CONVENTIONS: Mapping[str, tuple[Read, Lead]] = {
     "world": (_text, _world),

@@ -110,7 +110,7 @@ def dump_config(config: BaseModel) -> str:
 def dump_data(data: Any) -> str:
     """The same of plain data: mappings, lists, texts, numbers."""
     _check_finite(data, ())
-    readable = not re.search("[\x85\u2028\u2029\ufeff]", json.dumps(data, ensure_ascii=False))  # PyYAML folds these
+    readable = "\x85" not in json.dumps(data, ensure_ascii=False)  # PyYAML would read it back as a line feed
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=readable, width=120)
 
 

@@ -731,6 +731,13 @@ def test_pages_that_share_lists_of_strips(tmp_path: Path) -> None:
     refused(path, "directories or lists of strips that overlap", action=describe)
 
 
+def test_a_list_of_strips_may_be_as_long_as_the_file_holds(tmp_path: Path) -> None:
+    """17 MiB of offsets, and as many counts, of rows of one voxel: true, and refused for being one page only."""
+    path, rows = tmp_path / "a.tif", 17 * 2**18
+    path.write_bytes(tiff_of(1, rows, pages=1, strip=b"?", strips=rows))
+    refused(path, "a stack of two or more pages", "1 (a 2-D image)", action=describe, peak=2**27)
+
+
 def test_strips_that_hold_much_and_are_little(tmp_path: Path) -> None:
     """A strip of a million empty blocks, shared; a tile of 64 MiB for a plane of one voxel, shared."""
     path = tmp_path / "a.tif"
