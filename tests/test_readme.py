@@ -18,7 +18,7 @@ def blocks(language: str) -> list[str]:
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     fl.save_volume(fl.Volume((255 * torch.rand(8, 9, 10)).to(torch.uint8)), "engine.nrrd")
-    names = {"points": torch.rand(5, 3) * 7}
+    names = {"points": torch.rand(5, 3) * 7, "matrix": torch.eye(4)}
     code = "\n".join(blocks("python")).replace("(512, 512)", "(16, 16)")
     exec(compile(code, str(README), "exec"), names)
     assert names["v"].shape == (5,)
