@@ -123,7 +123,7 @@ def moved_by_rounding(
 ) -> list[tuple[Tensor, float]]:
     """Results in float64, and how far each moves, at most, when every number that goes in is off by a rounding.
 
-    Backward analysis: what computes with float32 gives the exact result of numbers that are off by few roundings, and is
+    Backward analysis: what computes with float32 gives the exact result of numbers that are a few roundings off, and is
     as far from it as those move it, and by the rounding of the result. `unit` is half of the distance of numbers at 1.
     """
     exact = [part.detach() for part in function(*inputs)]

@@ -261,7 +261,7 @@ def squared_values(method: str, samples: torch.Tensor, points: torch.Tensor) -> 
 @every_method
 @pytest.mark.parametrize("storage", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
 def test_gradients_reach_a_volume_of_any_floating_type(method, storage):
-    """Those of numbers a few roundings of the points' type off (8; 4.5 is the most of 8 seeds), and rounded once more."""
+    """Those of numbers a few roundings off (8; the worst of 8 seeds took 4.5), rounded once more as they are kept."""
     points, stored = off_knots(30), volume().to(storage)
     points = points if storage == torch.float64 else points.float()
     found = squared_values(method, stored, points)
