@@ -252,20 +252,27 @@ def test_operations_refuse_what_they_cannot_do():
 # ---- what gradients flow to
 
 
+def squared_values(method: str, samples: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """The derivative of Σ value² by the samples."""
+    leaf = samples.clone().requires_grad_()
+    return torch.autograd.grad(reconstruct(leaf, method)(points).square().sum(), leaf)[0]
+
+
 @every_method
 @pytest.mark.parametrize("storage", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
 def test_gradients_reach_a_volume_of_any_floating_type(method, storage):
-    points = off_knots(30)
-    exact = volume().requires_grad_()
-    reconstruct(exact, method)(points).square().sum().backward()
-    stored = volume().to(storage).requires_grad_()
-    value = reconstruct(stored, method)(points.float() if storage != torch.float64 else points)
-    value.square().sum().backward()
-    assert stored.grad is not None
-    assert exact.grad is not None
-    assert stored.grad.dtype == storage
+    """Those of numbers a few roundings off (8; the worst of 8 seeds took 4.5), rounded once more as they are kept."""
+    points, stored = off_knots(30), volume().to(storage)
+    points = points if storage == torch.float64 else points.float()
+    found = squared_values(method, stored, points)
+    assert found.dtype == storage
+    exact = [stored.double(), points.double()]
+    draws = 3 if storage == torch.float32 else 0  # beside what halves are rounded by nothing counts
+    ((expected, moved),) = laws.moved_by_rounding(lambda *given: [squared_values(method, *given)], exact, draws=draws)
+    scale = float(expected.abs().max())
+    assert moved < 1e-5 * scale
     laws.assert_close(
-        stored.grad.double(), exact.grad, 20 * float(torch.finfo(storage).eps), float(exact.grad.abs().max())
+        found.double(), expected, 8 * moved if storage == torch.float32 else torch.finfo(storage).eps * scale
     )
 
 

@@ -414,6 +414,7 @@ def test_a_volume_without_detail_is_resolved() -> None:
         assert all(c.resolved for c in answer.candidates)
     noise = torch.rand(20, 20, 20, generator=torch.Generator().manual_seed(0))
     assert not any(c.resolved for c in recommend(noise, 0.5, methods=["tricubic"], **FAST).candidates)
+    assert all(c.resolved for c in in_unit(1.0).candidates)  # waves far below the Nyquist frequency
 
 
 def test_a_scene_shows_one_volume(tmp_path, capsys) -> None:

@@ -16,8 +16,9 @@ from filterlab.ops.cpu import march as driver
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.plain import PlainMarcher
 from filterlab.volume import Boundary, Volume
+from tests import laws
 
-TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
+TOLERANCE = {torch.float32: 8e-6, torch.float64: 5e-14}  # of numbers up to 1; seen: 4e-6 and 1.6e-14
 BOUNDARIES = [b.value for b in Boundary]
 LIT = Shading((Light((1.0, -2.0, 1.0)), Light(None, (0.3, 0.4, 0.5))), ambient=0.3)
 PEAKS = TransferFunction.triangle_peaks([(0.35, 0.1, 0.4, (0.2, 0.4, 1.0)), (0.6, 0.2, 0.9, (1.0, 0.6, 0.2))], 0.2)
@@ -32,6 +33,10 @@ TYPED += [("triquadratic", "analytic", torch.float32), ("ncrsi", "central", torc
 
 def samples(dtype: torch.dtype = torch.float32, shape=(9, 12, 10)) -> Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
+
+
+def seeded(seed: int, *shape: int) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def turned(values: Tensor) -> Volume:
@@ -95,7 +100,9 @@ def test_any_number_of_control_points(points: int) -> None:
     x = torch.linspace(0.2, 0.8, points, dtype=torch.float64)  # not at equal steps exactly, but for 2
     generator = torch.Generator().manual_seed(points)
     rgb, alpha = (torch.rand(points, *more, generator=generator, dtype=torch.float64) for more in ((3,), ()))
-    assert_same(both(samples(torch.float64), transfer=TransferFunction(x, rgb, alpha, 9.0), dtype=torch.float64))
+    steep = max(points - 1, 1) / 0.6  # a value that is a rounding off moves an opacity by so many of them
+    images = both(samples(torch.float64), transfer=TransferFunction(x, rgb, alpha, 9.0), dtype=torch.float64)
+    assert_same(images, max(TOLERANCE[torch.float64], 2 * steep * torch.finfo(torch.float64).eps))
 
 
 def test_buckets_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -366,27 +373,43 @@ def only_fused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "gradient", "lit", "dtype"),
+    ("method", "gradient", "lit"),
     [
-        ("trilinear", "analytic", False, torch.float32),
-        ("trilinear", "central", True, torch.float64),
-        ("ncrsi", "analytic", True, torch.float64),
-        ("triquadratic", "analytic", True, torch.float64),
-        ("triquadratic", "analytic", True, torch.float32),
-        ("tricubic", "analytic", False, torch.float64),
+        ("trilinear", "central", True),
+        ("ncrsi", "analytic", True),
+        ("triquadratic", "analytic", True),
+        ("tricubic", "analytic", False),
     ],
 )
-def test_derivatives_in_everything(method, gradient, lit, dtype, monkeypatch) -> None:
+def test_derivatives_in_everything(method, gradient, lit, monkeypatch) -> None:
     p, names = scene_parameters(), ALL if lit else UNLIT
-    scene = {"method": method, "gradient": gradient, "lit": lit, "dtype": dtype}
+    scene = {"method": method, "gradient": gradient, "lit": lit}
     expected = derivatives(p, names, **scene, scheme="direct")
     only_fused(monkeypatch)
     found = derivatives(p, names, **scene)
     for name in names:
         scale = expected[name].abs().max()
         assert scale > 1e-4
-        limit = (2e-5 if dtype == torch.float32 else 1e-12) * scale
-        torch.testing.assert_close(found[name], expected[name], rtol=0, atol=float(limit), msg=name)
+        torch.testing.assert_close(found[name], expected[name], rtol=0, atol=float(1e-12 * scale), msg=name)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("method", "lit"), [("trilinear", False), ("triquadratic", True)])
+def test_float32_derivatives_are_those_of_numbers_a_few_roundings_off(method, lit, seed, monkeypatch) -> None:
+    """4 at most; of 48 scenes the worst took 1.6. Near a zero gradient normals turn, and a rounding moves much."""
+    only_fused(monkeypatch)
+    p, names = scene_parameters(volume=seeded(seed, 5, 6, 7)), ALL if lit else UNLIT
+
+    def exact(*values: Tensor) -> list[Tensor]:
+        return list(
+            derivatives(dict(zip(p, map(parameter, values), strict=True)), names, method=method, lit=lit).values()
+        )
+
+    found = derivatives(p, names, method=method, lit=lit, dtype=torch.float32)
+    moved = laws.moved_by_rounding(exact, [value.detach() for value in p.values()])
+    for name, (expected, limit) in zip(names, moved, strict=True):
+        assert limit < 1e-4 * float(expected.abs().max())
+        torch.testing.assert_close(found[name], expected, rtol=0, atol=4 * limit, msg=name)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -502,21 +525,28 @@ def test_derivatives_of_a_single_control_point(monkeypatch: pytest.MonkeyPatch) 
         torch.testing.assert_close(found, expected[name], rtol=1e-11, atol=1e-12, msg=name)
 
 
-def test_derivatives_of_stored_halves_and_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    batch = samples(torch.float32, (2, 2, 4, 5, 4))
-    for stored in (torch.float16, torch.float32):
-        results = []
-        for scheme in ("direct", "fused"):
-            leaf = batch.to(stored).requires_grad_()
-            field = reconstruct(turned(leaf), "catmull-rom", scheme=scheme)
-            with monkeypatch.context() as patch:
-                if scheme == "fused":
-                    only_fused(patch)
-                image = render(field, camera_for(field), SOFT, **SCENE, shading=LIT)
-                results.append(torch.autograd.grad(image.square().sum(), leaf)[0])
-        assert results[1].dtype == stored
-        tolerance = 2e-3 if stored == torch.float16 else 2e-5
-        torch.testing.assert_close(*results, rtol=tolerance, atol=tolerance * float(results[0].abs().max()))
+@pytest.mark.parametrize("stored", [torch.float16, torch.float32])
+def test_derivatives_of_stored_halves_and_batches(stored, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a volume a few roundings off; those of coefficients are rounded as they are stored, before up to eight of
+    them add up to that of a sample."""
+
+    def of(values: Tensor, dtype: torch.dtype, scheme: str = "fused") -> Tensor:
+        leaf = values.clone().requires_grad_()
+        field = reconstruct(turned(leaf), "catmull-rom", scheme=scheme)
+        image = render(field, camera_for(field), SOFT, **SCENE, shading=LIT, dtype=dtype)
+        return torch.autograd.grad(image.square().sum(), leaf)[0]
+
+    batch = seeded(1, 2, 2, 4, 5, 4).to(stored)
+    expected = of(batch.double(), torch.float64, "direct")
+    only_fused(monkeypatch)
+    found = of(batch, torch.float32)
+    ((again, limit),) = laws.moved_by_rounding(lambda values: [of(values, torch.float64)], [batch.double()])
+    scale = float(expected.abs().max())
+    torch.testing.assert_close(again, expected, rtol=0, atol=1e-12 * scale)
+    assert found.dtype == stored
+    assert limit < 1e-4 * scale
+    rounded = 8 * torch.finfo(stored).eps / 2 * scale if stored == torch.float16 else 0.0
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=4 * limit + rounded)
 
 
 def test_derivatives_are_the_same_bits_for_a_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
