@@ -11,7 +11,9 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from filterlab.fields.base import Field
 from filterlab.ops.reference.optics import Table
+from filterlab.render import suggestion
 
 Numbers = Sequence[float] | Tensor
 Peak = tuple[float | Tensor, float | Tensor, float | Tensor, Numbers]
@@ -76,6 +78,16 @@ class TransferFunction(Table):
         weights = torch.where(total > 0, shares, touching + torch.finfo(x.dtype).tiny)
         rgb = (weights / weights.sum(-1, keepdim=True)) @ colors
         return cls(x, rgb, total[:, 0], unit)
+
+    @classmethod
+    def suggested(cls, field: Field) -> Self:
+        """One to begin with, from the histogram of a field: what is around is clear, up to three classes of values are
+        not, in blue, tan and ivory; see `filterlab.render.suggestion`. Opacities are for a voxel.
+
+        Raises:
+            ValueError: a batched field, or one without a finite value.
+        """
+        return cls(*suggestion.tables(suggestion.sampled(field)), field.domain.voxel_size)
 
     @property
     def requires_grad(self) -> bool:
