@@ -9,7 +9,7 @@ import torch
 from filterlab import signals
 from filterlab.fields.base import Field
 from filterlab.io import save_image, save_volume
-from filterlab.io.config import ConfigError, dump_config
+from filterlab.io.config import ConfigError, dump_config, loads_config
 from filterlab.methods import reconstruct
 from filterlab.ops.differentiable import march
 from filterlab.render import (
@@ -23,7 +23,8 @@ from filterlab.render import (
     render,
 )
 from filterlab.scenes.build import PreparedSurface, build, load_scene, render_scene
-from filterlab.scenes.model import SurfaceModel, find_volume
+from filterlab.scenes.default import default_scene
+from filterlab.scenes.model import Scene, SurfaceModel, find_volume
 from filterlab.surfaces import LevelSet
 
 SCENES = Path(__file__).resolve().parent.parent / "configs" / "scenes"
@@ -322,3 +323,43 @@ def test_an_environment_may_be_a_picture(scene_file, tmp_path):
 def test_mistakes_of_surfaces_are_named(change, message, scene_file):
     with pytest.raises((ConfigError, ValueError), match=message):
         render_scene(load_scene(scene_file(SURFACE), change))
+
+
+# --- a volume alone ---------------------------------------------------------------------------------------------------
+
+
+def scan(folder):
+    """A ball with a dense core in air, with noise; a corner is missing."""
+    z, y, x = torch.meshgrid(*(torch.arange(float(n)) - n / 2 for n in (18, 20, 22)), indexing="ij")
+    radius = (x * x + y * y + z * z).sqrt()
+    samples = 100.0 * (radius < 8) + 300.0 * (radius < 3)
+    samples += 3 * torch.randn(samples.shape, generator=torch.Generator().manual_seed(1))
+    samples[:5, :5, :5] = math.nan
+    save_volume(samples, folder / "scan.npy")
+    return folder / "scan.npy"
+
+
+def test_a_volume_alone_is_just_shown(tmp_path):
+    scene = default_scene(scan(tmp_path), {"size": "[20, 16]"})
+    image = build(scene).render()
+    assert image.shape == (16, 20, 4)
+    assert image.isfinite().all()
+    assert 0.1 < (image[..., 3] > 0.5).double().mean() < 0.9
+    assert image[0, 0, 3] == 0
+    assert scene.method.nan == "propagate"
+    again = loads_config(dump_config(scene), Scene, name="written")
+    assert torch.equal(build(again).render(), image)
+
+
+def test_what_is_said_of_a_volume_alone_is_kept(tmp_path):
+    path = scan(tmp_path)
+    said = {"method": "{name: notch, nan: fill}", "transfer.unit": "3", "camera.up": "[0, 1, 0]", "step": "2"}
+    scene = default_scene(path, said)
+    assert (scene.method.name, scene.method.nan, scene.transfer.unit, scene.step) == ("notch", "fill", 3, 2)
+    assert scene.camera.up == (0, 1, 0)
+    with pytest.raises(ConfigError, match="unknown key"):
+        default_scene(path, {"colour": "red"})
+    with pytest.raises(ConfigError, match="found none"):
+        default_scene(tmp_path / "none.nrrd")
+    with pytest.raises(ValueError, match="got 125 NaN of"):
+        default_scene(path, {"method": "{name: notch, nan: refuse}"})

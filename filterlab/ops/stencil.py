@@ -155,6 +155,10 @@ class Lowered:
         """Whether that function has a weight for that tap at all."""
         return any(self.functions[axis][function][tap])
 
+    def taps_of(self, axis: int, function: int) -> list[int]:
+        """The taps that a function has a weight for."""
+        return [tap for tap in range(self.supports[axis]) if self.has(axis, function, tap)]
+
     def runs(self) -> list[tuple[range, tuple[int, ...]]]:
         """Runs of planes for which the same functions along z have a weight, with those functions."""
         functions = range(len(self.functions[2]))

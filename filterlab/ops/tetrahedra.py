@@ -264,6 +264,17 @@ LoweredStencil = Lowered | TetrahedralStencil
 AnyLattice = Lattice | TetrahedralLattice
 
 
+def reads_more(stencil: LoweredStencil) -> bool:
+    """Whether other rows read taps that the first one does not."""
+    if isinstance(stencil, TetrahedralStencil):
+        return False
+    first, *others = [
+        {tap for _, *own in row for tap in product(*(stencil.taps_of(axis, own[axis]) for axis in range(3)))}
+        for row in stencil.rows
+    ]
+    return any(not taps <= first for taps in others)
+
+
 def _exchange(along: Steps, axes: tuple[int, int]) -> Steps:
     own, (i, j) = list(along), axes
     own[i], own[j] = own[j], own[i]

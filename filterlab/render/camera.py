@@ -16,12 +16,17 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from filterlab.fields.base import Domain
+from filterlab.fields.base import Domain, Field
+from filterlab.geometry import times_matrix
+from filterlab.ops.reference.optics import Table
+from filterlab.render import suggestion
+from filterlab.render.transfer import TransferFunction
 
 Vector = Sequence[float] | Tensor
 Window = tuple[float, float, float, float]
 WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
 
+_PASSES = 8  # that bring what is seen to the middle, to a thousandth of the image
 _LARGEST_EXPONENT = 1000  # of a power of two that is a number of float64, as its inverse is
 
 
@@ -100,7 +105,7 @@ class Camera(ABC):
         position, target, up = (_vector(v, self.device) for v in (self.position, self.target, self.up))
         v, k = position - target, _unit(up)
         sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
-        moved = v * cosine + torch.linalg.cross(k, v) * sine + k * (k @ v) * (1 - cosine)
+        moved = v * cosine + torch.linalg.cross(k, v) * sine + k * (k * v).sum() * (1 - cosine)
         return replace(self, position=target + moved)
 
     @abstractmethod
@@ -158,14 +163,49 @@ class PerspectiveCamera(Camera):
             aspect: width / height of the whole image plane.
             margin: the box fills 1/margin of the image plane in one direction or the other; at least 1.
         """
-        if not 0 < field_of_view < 180:
-            raise ValueError(f"field_of_view must lie between 0 and 180 degrees; got {field_of_view}")
-        center, x, y, z, forward = _seen_corners(domain, direction, up, aspect, margin)
-        half = math.tan(math.radians(field_of_view) / 2)
-        distance = float((torch.maximum(x.abs() / aspect, y.abs()) * margin / half - z).max())
+        seen = _Seen.of(domain.corners(), direction, up, aspect, margin)
+        return cls._of(seen, up, field_of_view, window)
+
+    @classmethod
+    def suggested(
+        cls,
+        field: Field,
+        transfer: TransferFunction | None = None,
+        direction: Vector | None = None,
+        *,
+        up: Vector = (0.0, 0.0, 1.0),
+        field_of_view: float = 25.0,
+        aspect: float = 1.0,
+        margin: float = 1.05,
+    ) -> Self:
+        """The camera with all that is seen of a field in view, as near as it can be, and in the middle.
+
+        Args:
+            field: unbatched.
+            transfer: what its values look like; None: `TransferFunction.suggested`.
+            direction: the world direction in which the camera looks; None: along no axis, somewhat downwards, and of
+                anatomical coordinates from the front.
+            up, field_of_view, aspect, margin: as in `framing`.
+
+        Raises:
+            ValueError: as `framing` and `TransferFunction.suggested`.
+        """
+        given = suggestion.sampled(field)
+        table = Table(*suggestion.tables(given), 1.0) if transfer is None else transfer.to(torch.float64, "cpu")
+        value = given.values.nan_to_num(float(table.positions.detach()[0]))
+        opacity = table.opacity(table.locate(value)).detach().masked_fill(given.values.isnan(), 0)
+        points = suggestion.seen(given, opacity)
+        direction = suggestion.direction_for(field) if direction is None else direction
+        seen = _Seen.of(points, direction, up, aspect, margin).centered(_half_height(field_of_view))
+        return cls._of(seen, up, field_of_view)
+
+    @classmethod
+    def _of(cls, seen: _Seen, up: Vector, field_of_view: float, window: Window = WHOLE) -> Self:
+        """As near as it can be."""
+        distance = seen.distance(_half_height(field_of_view))
         return cls(
-            position=(center - distance * forward).tolist(),
-            target=center.tolist(),
+            position=(seen.center - distance * seen.forward).tolist(),
+            target=seen.center.tolist(),
             up=up,
             window=window,
             field_of_view=field_of_view,
@@ -206,10 +246,17 @@ class OrthographicCamera(Camera):
         window: Window = WHOLE,
     ) -> Self:
         """The camera looking along `direction` with all of `domain` in view; arguments as for the perspective one."""
-        center, x, y, _, forward = _seen_corners(domain, direction, up, aspect, margin)
-        height = 2 * margin * float(torch.maximum(x.abs() / aspect, y.abs()).max())
-        position = center - domain.diagonal * forward
-        return cls(position=position.tolist(), target=center.tolist(), up=up, window=window, height=height)
+        seen = _Seen.of(domain.corners(), direction, up, aspect, margin)
+        position = seen.center - domain.diagonal * seen.forward
+        target = seen.center.tolist()
+        return cls(position=position.tolist(), target=target, up=up, window=window, height=2 * float(seen.reach.max()))
+
+
+def _half_height(field_of_view: float) -> float:
+    """Of an image plane at distance 1. Raises ValueError for no angle."""
+    if not 0 < field_of_view < 180:
+        raise ValueError(f"field_of_view must lie between 0 and 180 degrees; got {field_of_view}")
+    return math.tan(math.radians(field_of_view) / 2)
 
 
 def check_size(size: Sequence[int]) -> tuple[int, int]:
@@ -276,20 +323,63 @@ def _unit(vector: Tensor) -> Tensor:
     return scaled / scaled.norm()
 
 
-def _seen_corners(
-    domain: Domain, direction: Vector, up: Vector, aspect: float, margin: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The box's centre, its corners along right, up and forward of the view (from the centre), and forward."""
-    _check_vector("direction", direction)
-    _check_vector("up", up)
-    if not 0 < aspect < math.inf:
-        raise ValueError(f"aspect must be positive (width / height); got {aspect}")
-    if not 1 <= margin < math.inf:
-        raise ValueError(f"margin must be at least 1; got {margin}")
-    corners = domain.corners()
-    center = corners.mean(0)
-    if not _vector(direction).any():
-        raise ValueError("direction must not be zero")
-    right, upward, forward = _basis(torch.zeros(3, dtype=torch.float64), _vector(direction).cpu(), _vector(up).cpu())
-    x, y, z = (((corners - center) * axis).sum(-1) for axis in (right, upward, forward))
-    return center, x, y, z, forward
+@dataclass(frozen=True)
+class _Seen:
+    """Points to be seen from a direction.
+
+    Attributes:
+        points: (M, 3) along right, up and forward of the view, from the centre.
+        center: what is looked at.
+        axes: right, up, forward (3, 3), in rows.
+        aspect: width / height of the image plane.
+        margin: they fill 1/margin of it in one direction or the other.
+    """
+
+    points: Tensor
+    center: Tensor
+    axes: Tensor
+    aspect: float
+    margin: float
+
+    @classmethod
+    def of(cls, points: Tensor, direction: Vector, up: Vector, aspect: float, margin: float) -> _Seen:
+        """World points (M, 3) about their mean. Raises ValueError for numbers out of range."""
+        _check_vector("direction", direction)
+        _check_vector("up", up)
+        if not 0 < aspect < math.inf:
+            raise ValueError(f"aspect must be positive (width / height); got {aspect}")
+        if not 1 <= margin < math.inf:
+            raise ValueError(f"margin must be at least 1; got {margin}")
+        if not _vector(direction).any():
+            raise ValueError("direction must not be zero")
+        axes = torch.stack(_basis(torch.zeros(3, dtype=torch.float64), _vector(direction).cpu(), _vector(up).cpu()))
+        center = points.mean(0)
+        return cls(times_matrix(points - center, axes.T), center, axes, aspect, margin)
+
+    @property
+    def forward(self) -> Tensor:
+        return self.axes[2]
+
+    @property
+    def reach(self) -> Tensor:
+        """(M,): half heights of an image plane that each point asks for."""
+        x, y, _ = self.points.unbind(-1)
+        return torch.maximum(x.abs() / self.aspect, y.abs()) * self.margin
+
+    def distance(self, half: float) -> float:
+        """From the centre to where all points are in view, of half heights `half` at distance 1."""
+        return float((self.reach / half - self.points[:, 2]).max())
+
+    def about(self, middle: Tensor) -> _Seen:
+        """The same about another point (3,)."""
+        return replace(self, points=self.points - middle, center=self.center + times_matrix(middle, self.axes))
+
+    def centered(self, half: float) -> _Seen:
+        """The same about what makes their ends in the image, of half heights `half`, as far on all sides."""
+        low, high = self.points.aminmax(dim=0)
+        seen = self.about((low + high) / 2)
+        for _ in range(_PASSES):
+            depth = (seen.points[:, 2:] + seen.distance(half)).clamp_min(torch.finfo(torch.float64).tiny)
+            low, high = (seen.points[:, :2] / depth).aminmax(dim=0)
+            seen = seen.about(torch.cat(((low + high) / 2, low.new_zeros(1))) * depth.mean())
+        return seen

@@ -11,9 +11,11 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from filterlab.fields.base import Field
 from filterlab.geometry import times_matrix
 from filterlab.io.images import from_srgb
 from filterlab.ops.reference.optics import Table
+from filterlab.render import suggestion
 from filterlab.render.colormaps import encoded_entries
 
 Numbers = Sequence[float] | Tensor
@@ -115,6 +117,16 @@ class TransferFunction(Table):
         x = torch.cat((colors.positions, ramp.positions)).sort().values
         x = x[torch.cat((x.new_ones(1, dtype=torch.bool), x.diff() > _FOOT * (high - low)))]
         return cls(x, colors.color(colors.locate(x)), ramp.opacity(ramp.locate(x)), unit)
+
+    @classmethod
+    def suggested(cls, field: Field) -> Self:
+        """One to begin with, from the histogram of a field: what is around is clear, up to three classes of values are
+        not, in blue, tan and ivory; see `filterlab.render.suggestion`. Opacities are for a voxel.
+
+        Raises:
+            ValueError: a batched field, or one without a finite value.
+        """
+        return cls(*suggestion.tables(suggestion.sampled(field)), field.domain.voxel_size)
 
     @property
     def requires_grad(self) -> bool:

@@ -38,7 +38,7 @@ from filterlab.ops.cpu.tape import Node, Tape
 from filterlab.ops.cpu.taps import Grid
 from filterlab.ops.cpu.traversal import Ray, Run, Segments, State, Traversal
 from filterlab.ops.march_derivatives import TABLE_ROW, gradient_columns
-from filterlab.ops.tetrahedra import LoweredStencil
+from filterlab.ops.tetrahedra import LoweredStencil, reads_more
 
 TABLES = 2  # of derivatives by the transfer function, to be summed
 
@@ -266,13 +266,16 @@ class _Program:
 
     # --- samples ---
 
-    def sampled(self, segments: Segments) -> tuple[Segments, list[Node]]:
-        """Rows of the stencil, and which segments are real: nothing is where one of the rows is NaN."""
-        b, rows = self.builder, self.taps.contract(segments.points, self.job.coefficients)
-        real = segments.real
-        for i in range(0, len(rows), 2):  # one comparison is of two
-            real = b.and_(real, b.fcmp_ordered("ord", rows[i], rows[min(i + 1, len(rows) - 1)]))
-        return replace(segments, real=real), [Node(row) for row in rows]
+    def sampled(self, segments: Segments) -> list[Node]:
+        """Rows of the stencil in the middle of segments."""
+        return [Node(row) for row in self.taps.contract(segments.points, self.job.coefficients)]
+
+    def known(self, segments: Segments, rows: Sequence[Node]) -> Segments:
+        """Those are real where no row is NaN: else nothing is there."""
+        b, real = self.builder, segments.real
+        for row in rows:
+            real = b.and_(real, b.fcmp_ordered("ord", row.value, row.value))
+        return replace(segments, real=real)
 
     def world_gradient(self, tape: Tape, gradient: Sequence[Node]) -> list[Node]:
         """Gradients of the grid in the world: Σ_i gradient_i matrix_ij."""
@@ -339,12 +342,15 @@ class _March(_Program):
 
     def _march(self, first: Run, second: Run, same: Value) -> None:
         e, b = self.lanes, self.builder
-        segments, rows = self.sampled(self._segments(first, second))
+        segments = self._segments(first, second)
+        rows = self.sampled(segments)
+        if reads_more(self.variant.stencil):  # else a gradient is NaN where the value is
+            segments = self.known(segments, rows[1:])
         tape = Tape(e)
         located = self.table.locate(tape, rows[0])
         opacity = self.table.opacity(tape, located)
         tau = optical_depth(tape, opacity, Node(segments.thickness)).value
-        tau = e.where(segments.real, tau, e.constant(0))
+        tau = e.where(segments.real, e.maximum(tau, e.constant(0)), e.constant(0))  # 0 where it is NaN
         with b.if_then(e.any(e.differs(tau))):
             absorbed = self._parts(e.negate(mathematics.expm1(e, e.negate(tau))))
             weights = self._compose(first, second, same, self._parts(tau), absorbed)
@@ -441,7 +447,9 @@ class _Adjoint(_Program):
 
     def _march(self, run: Run) -> None:
         ray = run.ray
-        segments, rows = self.sampled(self.traversal.segments(ray, run.first))
+        segments = self.traversal.segments(ray, run.first)
+        rows = self.sampled(segments)
+        segments = self.known(segments, rows)
         tape = Tape(self.lanes)
         located = self.table.locate(tape, rows[0])
         with self._if_it_counts(located, segments):

@@ -240,8 +240,8 @@ def _block(
 
 
 def _known(jet: Sequence[Tensor]) -> Tensor | None:
-    """Which of S samples are no NaN, in any of `(S, *)`; None: all of them."""
-    unknown = torch.stack([x.detach().isnan().reshape(len(x), -1).any(-1) for x in jet]).any(0)
+    """Which of S samples have no NaN in values `(S,)` and gradients `(S, 3)`; None: all of them."""
+    unknown = torch.stack([x.isnan() if x.ndim == 1 else x.isnan().any(-1) for x in jet]).any(0)
     return (~unknown).nonzero()[:, 0] if bool(unknown.any()) else None
 
 
