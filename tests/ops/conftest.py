@@ -16,3 +16,10 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "triton"))
     with np.errstate(all="ignore"):
         yield "cpu" if request.param == "interpreter" else "cuda"
+
+
+@pytest.fixture
+def compiling(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+    """The interpreter takes what the compiler would refuse; machine code needs no GPU to be made."""
+    monkeypatch.setenv("TRITON_INTERPRET", "0")
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))

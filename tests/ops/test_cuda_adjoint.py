@@ -13,16 +13,18 @@ from torch import Tensor
 pytest.importorskip("triton", reason="the package triton is not installed")
 
 from filterlab.kernels import LINEAR, bspline
-from filterlab.methods import reconstruct
+from filterlab.methods import METHODS, Tetrahedral, reconstruct
 from filterlab.ops import Stencil, march
 from filterlab.ops.cuda import adjoint, launch, segments
 from filterlab.ops.cuda import march as cuda
 from filterlab.ops.differentiable import march as op
 from filterlab.ops.march_derivatives import GRADIENTS
+from filterlab.ops.tetrahedra import TetrahedralStencil
 from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.bricks import bricks_of
 from filterlab.render.plain import PlainMarcher
 from filterlab.volume import Volume
+from tests.ops.front_end import intermediate
 from tests.ops.test_cuda_march import LIT, SCENE, SOFT, blob, camera_for, moved, volume
 from tests.ops.test_march import segment_without_length
 from tests.render.test_fused import CONTROL_POINTS
@@ -101,6 +103,12 @@ def test_equals_the_adjoint_on_the_cpu(method: str, shading: Shading | None, dty
     of_lights = {"shininess", "diffuse", "specular", "toward", "halfway"} if shading and not shading.lights else set()
     for name in names - of_lights:
         assert found[name].abs().max() > 1e-6, name  # a test of zeros would be none
+
+
+def test_splines_on_tetrahedra(device: str) -> None:
+    found = assert_agrees(prepared("qss", shading=LIT, size=(6, 5), step=2.0), device)
+    assert found.keys() == EVERYTHING["unlit"] | EVERYTHING["lit"]
+    assert all(x.abs().max() > 1e-6 for x in found.values())
 
 
 def test_behind_what_is_opaque(device: str) -> None:
@@ -296,23 +304,10 @@ def test_derivatives_of_an_image_are_the_plain_marchers(device: str, monkeypatch
 # --- compilation ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("stencil", "lights", "number", "stored", "taps"),
-    [
-        (Stencil.jet(LINEAR, 1), 1, "fp32", "fp16", 8),
-        (Stencil.jet(bspline(2), 0), None, "fp64", "i16", 27),  # in loops over planes
-    ],
-    ids=["lit", "unlit"],
-)
-def test_compiles_for_a_gpu_that_need_not_be_there(
-    stencil: Stencil, lights: int | None, number: str, stored: str, taps: int, monkeypatch: pytest.MonkeyPatch, tmp_path
-) -> None:
-    """The interpreter takes what the compiler would refuse; machine code needs no GPU to be made."""
-    from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]
-    from triton.compiler import ASTSource, compile  # pyright: ignore[reportMissingImports]
+def program_of(stencil: Stencil | TetrahedralStencil, lights: int | None, number: str, stored: str):
+    """What Triton compiles."""
+    from triton.compiler import ASTSource  # pyright: ignore[reportMissingImports]
 
-    monkeypatch.setenv("TRITON_INTERPRET", "0")
-    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
     derivatives, raised = stencil.derivatives
     slopes = (derivatives.lowered, raised)
     variant = adjoint.AdjointVariant(GRADIENTS, stencil.lowered, slopes, lights, skipping=True, even=False)
@@ -322,8 +317,34 @@ def test_compiles_for_a_gpu_that_need_not_be_there(
     types |= {"coefficients": f"*{stored}", "count": "*i64", "bricks": "*u8", "BLOCK": "constexpr"}
     written = launch.launchable(variant.write())
     signature = {p.name: types.get(p.name, "i32") for p in written.params}
-    source = ASTSource(written, signature, {"BLOCK": segments.BLOCK})
+    return ASTSource(written, signature, {"BLOCK": segments.BLOCK})
+
+
+@pytest.mark.parametrize(
+    ("stencil", "lights", "number", "stored", "taps"),
+    [
+        (Stencil.jet(LINEAR, 1), 1, "fp32", "fp16", 8),
+        (Stencil.jet(bspline(2), 0), None, "fp64", "i16", 27),  # in loops over planes
+    ],
+    ids=["lit", "unlit"],
+)
+def test_compiles_for_a_gpu_that_need_not_be_there(
+    stencil: Stencil, lights: int | None, number: str, stored: str, taps: int, compiling: None
+) -> None:
+    from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]
+    from triton.compiler import compile  # pyright: ignore[reportMissingImports]
+
+    source = program_of(stencil, lights, number, stored)
     made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})
     lines = made.asm["ptx"].splitlines()
     assert not [line for line in lines if "bar.sync" in line]  # one warp waits for nobody
     assert sum("atom.global" in line for line in lines) == taps + 2 * 10  # what is held is let go in two places
+
+
+@pytest.mark.parametrize("method", ["qss", "quadratic-c1"])
+def test_splines_on_tetrahedra_are_taken_by_the_compilers_front_end(method: str, compiling: None) -> None:
+    """Names that a branch gives other types than they had before it are refused."""
+    own = METHODS[method]
+    assert isinstance(own, Tetrahedral)
+    stencil = TetrahedralStencil(own.spline.lowered, (0, 1))
+    assert intermediate(program_of(stencil, 1, "fp32", "fp32")).count("tt.atomic_rmw") >= stencil.spline.size**3

@@ -18,6 +18,7 @@ from filterlab.ops.cuda import crossings, launch
 from filterlab.ops.cuda import raycast as cuda
 from filterlab.ops.differentiable import raycast
 from filterlab.ops.raycast import Raycast
+from tests.ops.front_end import intermediate
 from tests.ops.test_raycast import AFFINE, described, rays, rays_on_the_last_faces, samples
 from tests.test_methods import TENSOR_PRODUCTS
 
@@ -126,13 +127,6 @@ def test_a_field_on_a_gpu_is_cast_there(device: str, monkeypatch: pytest.MonkeyP
     assert asked == [3]
 
 
-@pytest.fixture
-def compiling(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
-    """The interpreter takes what the compiler would refuse; machine code needs no GPU to be made."""
-    monkeypatch.setenv("TRITON_INTERPRET", "0")
-    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
-
-
 def program_of(method: str, asked: str):
     """What Triton compiles, for numbers of 32 bits."""
     from triton.compiler import ASTSource  # pyright: ignore[reportMissingImports]
@@ -164,15 +158,5 @@ def test_compiles_for_a_gpu_that_need_not_be_there(method: str, asked: str, taps
 @pytest.mark.parametrize(("method", "asked"), [("cubic-c1", "candidates"), ("quadratic-c1", "first")])
 def test_is_taken_by_the_compilers_front_end(method: str, asked: str, compiling: None) -> None:
     """That of types and loops: what comes behind it takes 6 to 12 s for these programs."""
-    from triton._C.libtriton import ir  # pyright: ignore[reportMissingImports]
-    from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]
-    from triton.compiler.compiler import make_backend  # pyright: ignore[reportMissingImports]
-
-    target = GPUTarget("cuda", 80, 32)
-    backend, context = make_backend(target), ir.context()
-    ir.load_dialects(context)
-    backend.load_dialects(context)
-    options = backend.parse_options({"num_warps": 1})
-    given = target, options, backend.get_codegen_implementation(options), backend.get_module_map(), context
-    made = str(program_of(method, asked).make_ir(*given))
+    made = intermediate(program_of(method, asked))
     assert made.count("scf.while") == (3 if asked == "candidates" else 5)

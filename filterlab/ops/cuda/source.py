@@ -16,10 +16,16 @@ class Source:
     def __init__(self, name: str, parameters: Sequence[str]) -> None:
         self.name = name
         self._lines = [f"def {name}({', '.join(parameters)}):"]
-        self._depth = 1
+        self._depth, self._names = 1, 0
 
     def line(self, text: str) -> None:
         self._lines.append("    " * self._depth + text)
+
+    def named(self, expression: str) -> str:
+        """Its value by a name that nothing else in the program has: within loops and branches names keep their type."""
+        self._names += 1
+        self.line(f"t{self._names} = {expression}")
+        return f"t{self._names}"
 
     @contextmanager
     def block(self, head: str) -> Iterator[None]:

@@ -16,13 +16,7 @@ class Text:
     """The arithmetic of names: every operation is a line that names its result."""
 
     def __init__(self, source: Source) -> None:
-        self._source, self._count = source, 0
-
-    def named(self, expression: str) -> str:
-        self._count += 1
-        name = f"t{self._count}"
-        self._source.line(f"{name} = {expression}")
-        return name
+        self.named = source.named
 
     def constant(self, value: float) -> str:
         return number(value)
@@ -70,7 +64,7 @@ class TetrahedralTaps:
         self.sum = Sum(self.text, stencil)
 
     def locate(self, volume: str) -> None:
-        """As `Taps.locate`, but that `first` is the address of the coefficient of the index of a point's cell."""
+        """As `Taps.locate`, but that `cell` is the number of the coefficient of the index of a point's cell."""
         line, (before, behind) = self.source.line, self.sum.spline.reach
         first_taps(self.source, self.stencil.supports)
         for axis, size, cell in zip(AXES, SIZES, self.sum.cells(AXES), strict=True):
@@ -78,7 +72,8 @@ class TetrahedralTaps:
             line(f"own = tl.where(own < start + {size} - {behind + 1}, own, start + {size} - {behind + 1})")
             line(f"u{axis} = {self.sum.local(axis, 'own')} + {axis} * 0.0")
             line(f"cell_{axis} = own.to(tl.int64) - start")
-        line(f"first = {volume} + ((cell_z * height + cell_y) * width + cell_x)")
+        line("cell = (cell_z * height + cell_y) * width + cell_x")
+        line(f"first = {volume} + cell")
         line("nothing = ux * 0.0 + uy * 0.0 + uz * 0.0")
 
     def weigh(self) -> None:
