@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 from filterlab.fields.base import Field
 
 Clock = Callable[[], float]
@@ -100,7 +101,7 @@ class Cost:
 
 def measure(
     candidates: Mapping[str, Callable[[], Field]],
-    points: Tensor | Mapping[str, Tensor],
+    points: Array | Mapping[str, Array],
     *,
     order: int = 1,
     seconds: float = 2.0,
@@ -131,7 +132,7 @@ def measure(
     Raises:
         ValueError: no points, or points that the fields refuse.
     """
-    where = {name: points if isinstance(points, Tensor) else points[name] for name in candidates}
+    where = {name: as_tensor(points[name] if isinstance(points, Mapping) else points) for name in candidates}
     for name, p in where.items():
         if p.numel() == 0:
             raise ValueError(f"expected points (P, 3) with P ≥ 1 to sample {name} at; got shape {tuple(p.shape)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -102,6 +103,15 @@ class Geometry:
         Raises ValueError for a matrix that is not 4×4, finite, invertible, with the last row 0 0 0 1.
         """
         return Geometry.of(affine=Geometry.of(affine=affine).affine @ self.affine, world=self.world)
+
+    def part(self, ranges: Sequence[range]) -> Geometry:
+        """That of the voxels start + step · i of ranges along x, y, z; the origin is rounded once."""
+        matrix = tuple(tuple(row[d] * r.step for d, r in enumerate(ranges)) for row in self.matrix)
+        origin = tuple(
+            float(Fraction(o) + sum(Fraction(row[d]) * r.start for d, r in enumerate(ranges)))
+            for o, row in zip(self.origin, self.matrix, strict=True)
+        )
+        return Geometry(matrix, origin, self.world)  # type: ignore[arg-type]
 
     @property
     def affine(self) -> np.ndarray:

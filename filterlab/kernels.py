@@ -17,6 +17,8 @@ from functools import cached_property, lru_cache
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
+
 Rational = int | float | Fraction
 Pieces = tuple[tuple[Fraction, ...], ...]
 
@@ -48,8 +50,9 @@ class PiecewisePolynomial(ABC):
         """
         return self.table(dtype, device).flip(0)
 
-    def __call__(self, x: Tensor, derivative: int = 0) -> Tensor:
+    def __call__(self, x: Array, derivative: int = 0) -> Tensor:
         """φ^(derivative)(x), elementwise; at a knot the piece to its right counts. Differentiable in x."""
+        x = as_tensor(x)
         table = differentiate(self.table(x.dtype, x.device), derivative)
         shifted = x + self.support / 2
         piece = torch.nan_to_num(shifted.floor()).clamp(0, self.support - 1).long()
@@ -57,12 +60,13 @@ class PiecewisePolynomial(ABC):
         value = horner(table[piece].movedim(-1, 0), u)
         return torch.where((shifted >= 0) & (shifted < self.support), value, 0 * value)
 
-    def fourier(self, omega: Tensor) -> Tensor:
+    def fourier(self, omega: Array) -> Tensor:
         """φ̂(ω) = ∫ φ(x) e^{−iωx} dx in closed form; complex, to rounding, for every ω (radians per voxel).
 
         Σ_i e^{−iω(i−S/2)} Σ_j a_ij E_j(ω) with E_j(ω) = ∫₀¹ u^j e^{−iωu} du: by its power series for |ω| < 4, by the
         recursion E_j = (j E_{j−1} − e^{−iω}) / (iω) beyond. Differentiable in ω and in the table.
         """
+        omega = as_tensor(omega)
         omega = omega.to(torch.promote_types(omega.dtype, torch.float64))
         table = self.table(torch.float64, omega.device)
         basis = torch.stack(_exponential_moments(omega, self.degree))

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from filterlab import kernels, missing_values, prefilters
+from filterlab.arrays import Array
 from filterlab.fields.base import Field
 from filterlab.fields.grid import Coefficients, GridField, Scheme, Term, implementation_of
 from filterlab.fields.ncrsi import NCRSI_TERMS, SevenSamples
@@ -436,7 +437,7 @@ def checked(method: str | Method | PiecewisePolynomial, prefilter: bool) -> Meth
 
 
 def reconstruct(
-    volume: Volume | Tensor,
+    volume: Volume | Array,
     method: str | Method | PiecewisePolynomial = "triquadratic",
     *,
     boundary: str | Boundary = Boundary.MIRROR,
@@ -450,7 +451,8 @@ def reconstruct(
     """A continuous, differentiable field from a sampled volume: f(x) = Σ_k c_k φ(x − k), c = prefilter(samples).
 
     Args:
-        volume: a `Volume`, or a bare tensor (D, H, W) or (N, C, D, H, W) whose voxel centres are the integers.
+        volume: a `Volume`, or bare samples (D, H, W) or (N, C, D, H, W), a tensor or a NumPy array, whose voxel centres
+            are the integers.
         method: a name from `METHODS`, a `Method`, or a kernel; an exact kernel that does not interpolate gets the
             prefilter with which it does, a `TensorKernel` has none and needs prefilter=False.
         boundary: how the samples go on beyond the ends: mirror, reflect, wrap, border or zeros.

@@ -1,4 +1,7 @@
-"""How far two functions, gradient fields or images are apart. Image metrics come from kornia and scikit-image."""
+"""How far two functions, gradient fields or images are apart. Image metrics come from kornia and scikit-image.
+
+All take tensors and NumPy arrays.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 
-def _comparable(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+
+def _comparable(a: Array, b: Array) -> tuple[Tensor, Tensor]:
     """Both as floating point of one type. Raises ValueError for different shapes."""
+    a, b = as_tensor(a), as_tensor(b)
     if a.shape != b.shape:
         raise ValueError(f"both must have the same shape; got {tuple(a.shape)} and {tuple(b.shape)}")
     dtype = torch.promote_types(torch.promote_types(a.dtype, b.dtype), torch.float32)
@@ -26,7 +32,7 @@ def _at_scale(x: Tensor, dim: int | None = None) -> tuple[Tensor, Tensor]:
     return x / unit, unit
 
 
-def rms(a: Tensor, b: Tensor, vectors: bool = False) -> Tensor:
+def rms(a: Array, b: Array, vectors: bool = False) -> Tensor:
     """√mean |a − b|²; with vectors=True |·| is the length along the last axis (gradients)."""
     a, b = _comparable(a, b)
     difference, unit = _at_scale(a - b)
@@ -34,14 +40,14 @@ def rms(a: Tensor, b: Tensor, vectors: bool = False) -> Tensor:
     return unit * (squared.sum(-1) if vectors else squared).mean().sqrt()
 
 
-def max_error(a: Tensor, b: Tensor, vectors: bool = False) -> Tensor:
+def max_error(a: Array, b: Array, vectors: bool = False) -> Tensor:
     """max |a − b|; with vectors=True |·| is the length along the last axis."""
     a, b = _comparable(a, b)
     difference, unit = _at_scale(a - b)
     return unit * (difference.norm(dim=-1) if vectors else difference.abs()).max()
 
 
-def angular_error(a: Tensor, b: Tensor) -> Tensor:
+def angular_error(a: Array, b: Array) -> Tensor:
     """The angle between vectors `(..., 3)` in radians, `(...)`: atan2(|a × b|, a · b), accurate for tiny angles too.
 
     Where either vector is zero the angle is NaN: it has no direction.
@@ -53,7 +59,7 @@ def angular_error(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(undefined, torch.full_like(angle, torch.nan), angle)
 
 
-def psnr(a: Tensor, b: Tensor, peak: float = 1.0) -> float:
+def psnr(a: Array, b: Array, peak: float = 1.0) -> float:
     """Peak signal-to-noise ratio 20 log₁₀(peak / rms) in dB; infinite for equal images. Through kornia."""
     from kornia.metrics import psnr as kornia_psnr
 
@@ -61,7 +67,7 @@ def psnr(a: Tensor, b: Tensor, peak: float = 1.0) -> float:
     return float(kornia_psnr(a.detach(), b.detach(), peak))
 
 
-def ssim(a: Tensor, b: Tensor, peak: float = 1.0) -> float:
+def ssim(a: Array, b: Array, peak: float = 1.0) -> float:
     """Mean structural similarity of images (H, W) or (H, W, 3), Gaussian window σ = 1.5. Through scikit-image.
 
     Source: Wang, Bovik, Sheikh & Simoncelli, Image quality assessment, IEEE Trans. Image Processing 13, 2004.

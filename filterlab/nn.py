@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array
 from filterlab.fields.base import Field
 from filterlab.fields.grid import GridField
 from filterlab.kernels import PiecewisePolynomial
@@ -46,7 +47,7 @@ class Reconstruction(torch.nn.Module):
 
     def __init__(
         self,
-        volume: Volume | Tensor | Sequence[int],
+        volume: Volume | Array | Sequence[int],
         method: str | Method | PiecewisePolynomial = "triquadratic",
         *,
         learnable: bool = True,
@@ -56,7 +57,7 @@ class Reconstruction(torch.nn.Module):
         gradient: str | None = None,
     ) -> None:
         super().__init__()
-        given = as_volume(volume if isinstance(volume, Volume | Tensor) else torch.zeros(_checked_shape(volume)))
+        given = as_volume(volume if isinstance(volume, Volume | Array) else torch.zeros(_checked_shape(volume)))
         samples = given.samples.detach()
         self.method, self.boundary = as_method(method), Boundary.named(boundary)
         self.geometry = given.geometry
@@ -83,15 +84,15 @@ class Reconstruction(torch.nn.Module):
             self._kept = *key, self._made()
         return self._kept[2]
 
-    def forward(self, points: Tensor) -> Tensor:
+    def forward(self, points: Array) -> Tensor:
         """Values at world points; see `Field`."""
         return self.field()(points)
 
-    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def value_and_gradient(self, points: Array) -> tuple[Tensor, Tensor]:
         """Values and gradients (per world unit) at world points, in one pass; see `Field`."""
         return self.field().value_and_gradient(points)
 
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+    def jet(self, points: Array, order: int) -> tuple[Tensor, ...]:
         """(value,), (value, gradient) or (value, gradient, Hessian) at world points; see `Field`."""
         return self.field().jet(points, order)
 
@@ -159,7 +160,7 @@ class Reconstruction(torch.nn.Module):
 
 def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
     if not isinstance(shape, tuple | list):
-        raise TypeError(f"expected a Volume, a torch.Tensor or a shape; got {type(shape).__name__}")
+        raise TypeError(f"expected a Volume, a torch.Tensor, a NumPy array or a shape; got {type(shape).__name__}")
     sizes = tuple(shape)
     if not all(isinstance(n, int) and n > 0 for n in sizes) or len(sizes) not in (3, 5):
         raise ValueError(f"a shape must be (D, H, W) or (N, C, D, H, W), integers ≥ 1; got {sizes}")

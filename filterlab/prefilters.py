@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 from filterlab.kernels import Kernel, bspline
 
 
@@ -49,8 +50,9 @@ class Prefilter:
     def is_identity(self) -> bool:
         return len(self.factors) == 0
 
-    def response(self, omega: Tensor) -> Tensor:
+    def response(self, omega: Array) -> Tensor:
         """P(ω) = Π 1 / q̂(ω); ω in radians per voxel."""
+        omega = as_tensor(omega)
         out = torch.ones_like(omega)
         for factor in self.factors:
             q = torch.full_like(omega, float(factor[0]))

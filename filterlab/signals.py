@@ -15,6 +15,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array
 from filterlab.fields.base import Domain, Field, check_order, check_points, type_of_rays
 from filterlab.fields.crossings import Along, Bounds, crossings, stepped
 from filterlab.geometry import Geometry, times_matrix
@@ -141,7 +142,7 @@ class Signal(Field):
 
     # --- at points ---
 
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+    def jet(self, points: Array, order: int) -> tuple[Tensor, ...]:
         """Value, exact gradient and (by automatic differentiation of the gradient) Hessian."""
         check_order(order, self.max_order)
         points = check_points(points, None)

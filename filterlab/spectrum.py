@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from filterlab import prefilters
+from filterlab.arrays import Array, as_tensor
 from filterlab.fields.base import Field
 from filterlab.kernels import PiecewisePolynomial
 from filterlab.methods import Method, TensorProduct, as_method, reconstruct, tensor_product
@@ -24,9 +25,9 @@ from filterlab.volume import Boundary
 NODES = 16  # Gauss-Legendre nodes per half voxel: exact to rounding for a kernel's piece times e^{−iωx}, |ω| ≤ 8π
 
 
-def kernel_response(kernel: PiecewisePolynomial, omega: Tensor) -> Tensor:
+def kernel_response(kernel: PiecewisePolynomial, omega: Array) -> Tensor:
     """Φ(ω) of a symmetric kernel, real."""
-    return kernel.fourier(omega).real
+    return kernel.fourier(as_tensor(omega)).real
 
 
 def closed_form(method: str | Method | PiecewisePolynomial) -> TensorProduct:
@@ -37,22 +38,22 @@ def closed_form(method: str | Method | PiecewisePolynomial) -> TensorProduct:
     return found
 
 
-def axis_response(method: str | Method | PiecewisePolynomial, omega: Tensor, prefilter: bool = True) -> Tensor:
+def axis_response(method: str | Method | PiecewisePolynomial, omega: Array, prefilter: bool = True) -> Tensor:
     """P(ω)Φ(ω) along an axis, closed form, float64 (paper, figures 2-4).
 
     For ncrsi, whose kernel is not separable, this is its 3-D response at (ω, 0, 0): the Catmull-Rom spline's.
     `response` has the whole of it.
     """
     method = closed_form(method)
-    omega = omega.to(torch.float64)
+    omega = as_tensor(omega).to(torch.float64)
     response = kernel_response(method.kernel, omega)
     return response * method.prefilter.response(omega) if prefilter else response
 
 
-def response(method: str | Method | PiecewisePolynomial, omega: Tensor, prefilter: bool = True) -> Tensor:
+def response(method: str | Method | PiecewisePolynomial, omega: Array, prefilter: bool = True) -> Tensor:
     """The 3-D response at angular frequencies `(..., 3)` (x, y, z): Σ_terms Π_axes Φ(ω_d), times Π P(ω_d)."""
     method = closed_form(method)
-    omega = omega.to(torch.float64)
+    omega = as_tensor(omega).to(torch.float64)
     if method.terms is None:
         total = kernel_response(method.kernel, omega).prod(-1)
     else:
@@ -64,7 +65,7 @@ def response(method: str | Method | PiecewisePolynomial, omega: Tensor, prefilte
 
 
 def measured_response(
-    method: str | Method | PiecewisePolynomial, omega: Tensor, prefilter: bool = True, scheme: str | None = None
+    method: str | Method | PiecewisePolynomial, omega: Array, prefilter: bool = True, scheme: str | None = None
 ) -> Tensor:
     """The response of the implementation: ∫ h(x) e^{−iωx} dx of the field's own impulse response h, real, float64.
 
@@ -72,7 +73,7 @@ def measured_response(
     is averaged over y and z within a voxel, which is right for methods that do not reproduce constants, too. The
     integral is Gauss-Legendre quadrature on every half voxel; nothing of the closed form is used.
     """
-    method = as_method(method)
+    method, omega = as_method(method), as_tensor(omega)
     reach = method.reach(prefilter)
     samples = torch.zeros(1, 1, 2 * reach + 1, dtype=torch.float64, device=omega.device)
     samples[..., reach] = 1
@@ -85,7 +86,7 @@ def measured_response(
     return (phases * (impulse * weights)).sum(-1)
 
 
-def position_responses(method: str | Method | PiecewisePolynomial, omega: Tensor, nodes: int = 6) -> Tensor:
+def position_responses(method: str | Method | PiecewisePolynomial, omega: Array, nodes: int = 6) -> Tensor:
     """The 3-D responses of the implementation without prefilter, to one sample at each position in its partition.
 
     ĥ_p(ω) = ∫ h_p(x) cos(ω·x) dx at angular frequencies `(..., 3)` (x, y, z), h_p(x) the field at p + x of a sample at
@@ -97,7 +98,7 @@ def position_responses(method: str | Method | PiecewisePolynomial, omega: Tensor
     nodes it is off by 2e-11 where pieces are boxes; faces of tetrahedra cross the half voxels: 2e-4 (`qss`, C⁰ there)
     and 8e-6 (both C¹ splines), along the axes 1e-11.
     """
-    method = as_method(method)
+    method, omega = as_method(method), as_tensor(omega)
     place = 2 * method.reach(False)  # even: the partition lies about it as about 0
     size = 2 * place + 2
     x, weights = _half_voxel_quadrature(method.facts.support, omega.device, nodes)

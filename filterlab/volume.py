@@ -6,19 +6,25 @@ z along D. Points, spacings and origins are in x, y, z order; only tensor shapes
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from itertools import product
+from types import EllipsisType
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 from filterlab.geometry import Geometry
 from filterlab.world import UNDECLARED, World
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
+
+_OUTSIDE = 1e-9  # of a voxel's longest edge: as far outside of a box a centre still counts as within
 
 
 class Boundary(StrEnum):
@@ -159,7 +165,7 @@ class Volume:
 
     Args:
         samples: `(D, H, W)` or `(N, C, D, H, W)`; real, any integer or floating dtype. Kept as it is: neither copied,
-            converted nor moved; gradients flow back to it.
+            converted nor moved; gradients flow back to it. A NumPy array as `filterlab.arrays.as_tensor`.
         spacing: world length of a voxel along x, y, z; default 1.
         origin: world position of the centre of voxel (0, 0, 0); default 0.
         affine: instead of both, a 4×4 matrix from voxel (x, y, z, 1) to world.
@@ -172,7 +178,7 @@ class Volume:
 
     def __init__(
         self,
-        samples: Tensor,
+        samples: Array,
         spacing: Sequence[float] | float | None = None,
         origin: Sequence[float] | None = None,
         affine: ArrayLike | Tensor | None = None,
@@ -226,15 +232,83 @@ class Volume:
         """What is declared of the world."""
         return self.geometry.world
 
-    def to(self, *args, **kwargs) -> Volume:
-        """The same volume with `samples.to(...)`."""
+    @overload
+    def to(self, dtype: torch.dtype, non_blocking: bool = ..., copy: bool = ...) -> Volume: ...
+    @overload
+    def to(
+        self,
+        device: torch.device | str | int | None = ...,
+        dtype: torch.dtype | None = ...,
+        non_blocking: bool = ...,
+        copy: bool = ...,
+    ) -> Volume: ...
+    @overload
+    def to(self, other: Tensor, non_blocking: bool = ..., copy: bool = ...) -> Volume: ...
+    def to(self, *args: Any, **kwargs: Any) -> Volume:
+        """The same volume with `samples.to(...)`: another type or device, with the same geometry; differentiable."""
         return Volume.with_geometry(self.samples.to(*args, **kwargs), self.geometry)
 
-    def voxel_to_world(self, voxels: Tensor) -> Tensor:
-        return self.geometry.to_world(voxels)
+    def numpy(self) -> np.ndarray:
+        """The samples as a NumPy array, of their shape and type, without derivatives.
 
-    def world_to_voxel(self, points: Tensor) -> Tensor:
-        return self.geometry.to_voxel(points)
+        It shares their memory where they are on the CPU. bfloat16, which NumPy lacks, becomes float32, exactly.
+        """
+        samples = self.samples.detach().cpu().resolve_neg()
+        return (samples.float() if samples.dtype == torch.bfloat16 else samples).numpy()
+
+    def __getitem__(self, index: slice | int | EllipsisType | tuple[slice | int | EllipsisType, ...]) -> Volume:
+        """A part of the grid, where it lies: slices of the axes z, y, x, as samples are indexed; steps too.
+
+        voxel (i, j, k) of the part is voxel (first + step·i, …) of this volume along each axis, and has its world
+        position: origin and matrix follow exactly what was cut. An integer keeps its axis, with one voxel. A step below
+        0 turns an axis round. Entries and channels of a batch are all kept; fewer indices than axes go to the first.
+
+        Returns:
+            a volume whose samples are a view of these (a copy for steps below 0); differentiable.
+
+        Raises:
+            IndexError: more than three indices, an integer out of range. ValueError: an empty part, a step of 0.
+            TypeError: an index of another kind.
+        """
+        parts = [
+            _part(name, one, n) for name, one, n in zip("zyx", _three(index), self.samples.shape[-3:], strict=True)
+        ]
+        samples = self.samples[(..., *(slice(min(p[0], p[-1]), max(p[0], p[-1]) + 1, abs(p.step)) for p in parts))]
+        if turned := [dim for dim, part in zip((-3, -2, -1), parts, strict=True) if part.step < 0]:
+            samples = samples.flip(turned)
+        return Volume.with_geometry(samples, self.geometry.part(parts[::-1]))
+
+    def crop(self, lower: Sequence[float] | Array, upper: Sequence[float] | Array) -> Volume:
+        """The smallest part of the grid that has every voxel whose centre lies in a box of the world.
+
+        Args:
+            lower, upper: opposite corners of the box in x, y, z, which is closed; ±inf where nothing is to be cut. A
+                centre counts as within when it is no farther outside than 1e-9 of a voxel's edge, as rounding puts it.
+
+        An oblique grid is cut along its own axes: then voxels outside of the box are in the part, too. The rounding of
+        coordinates to voxels is in float64.
+
+        Raises:
+            ValueError: not two corners, lower above upper, a box without a voxel's centre (it says where the grid is).
+        """
+        low, high = (_corner(name, corner) for name, corner in (("lower", lower), ("upper", upper)))
+        if any(a > b for a, b in zip(low, high, strict=True)):
+            raise ValueError(f"lower must not be above upper along x, y, z; got {low} and {high}")
+        ranges = _ranges_within(self.geometry, self.size, low, high)
+        if ranges is None:
+            ends = torch.tensor(list(product(*((0.0, n - 1.0) for n in self.size))), dtype=torch.float64)
+            near, far = (end.tolist() for end in self.geometry.to_world(ends).aminmax(dim=0))
+            raise ValueError(f"no voxel's centre lies from {low} to {high}; those of the grid lie from {near} to {far}")
+        x, y, z = (slice(part.start, part.stop) for part in ranges)
+        return self[z, y, x]
+
+    def voxel_to_world(self, voxels: Array) -> Tensor:
+        """Voxel coordinates `(..., 3)` to world points."""
+        return self.geometry.to_world(as_tensor(voxels))
+
+    def world_to_voxel(self, points: Array) -> Tensor:
+        """World points `(..., 3)` to voxel coordinates."""
+        return self.geometry.to_voxel(as_tensor(points))
 
     def __repr__(self) -> str:
         dtype = str(self.dtype).removeprefix("torch.")
@@ -242,9 +316,73 @@ class Volume:
         return f"Volume(shape={tuple(self.shape)}, dtype={dtype}, spacing={spacing}, origin={origin})"
 
 
-def _checked_samples(samples: Tensor) -> Tensor:
+Index = slice | int | EllipsisType
+
+
+def _three(index: Index | tuple[Index, ...]) -> tuple[slice | int, slice | int, slice | int]:
+    """Indices of z, y, x; an ellipsis, and what is not given, stands for whole axes."""
+    given = list(index) if isinstance(index, tuple) else [index]
+    if given.count(...) > 1 or len(given) - given.count(...) > 3:
+        raise IndexError(f"a volume is indexed along z, y, x, three indices and one ellipsis at most; got {index!r}")
+    missing = [slice(None)] * (3 - len(given) + given.count(...))
+    place = given.index(...) if ... in given else len(given)
+    return tuple(given[:place] + missing + given[place + 1 :])  # type: ignore[return-value]
+
+
+def _part(name: str, index: slice | int, n: int) -> range:
+    """The voxels of an axis that an index asks for; never empty."""
+    if isinstance(index, slice):
+        part = range(n)[index]
+        if not part:
+            raise ValueError(f"expected a part with voxels along {name}; got {index} of {n}")
+        return part
+    if isinstance(index, bool) or not hasattr(index, "__index__"):
+        raise TypeError(f"a volume is indexed by slices and integers; got {type(index).__name__} along {name}")
+    if not -n <= index < n:
+        raise IndexError(f"expected an index along {name} of {n} voxels; got {index}")
+    first = operator.index(index) % n
+    return range(first, first + 1)
+
+
+def _ranges_within(
+    geometry: Geometry, size: Sequence[int], lower: Sequence[float], upper: Sequence[float]
+) -> tuple[range, range, range] | None:
+    """The least ranges along x, y, z of a grid with every voxel whose centre lies in the box; None: there is none.
+
+    Memory: coordinates of three lines where the axes are the world's, else of one slice of the grid.
+    """
+    slack = _OUTSIDE * max(geometry.spacing)
+    box = torch.tensor([lower, upper], dtype=torch.float64) + torch.tensor([[-slack], [slack]], dtype=torch.float64)
+    lines = [torch.arange(n, dtype=torch.float64) for n in size]
+    if geometry.diagonal is not None:
+        voxels = (step * line + o for step, line, o in zip(geometry.diagonal, lines, geometry.origin, strict=True))
+        met = [line[(v >= a) & (v <= b)] for line, v, a, b in zip(lines, voxels, *box.tolist(), strict=True)]
+    else:
+        slices = (_within(geometry, torch.cartesian_prod(*lines[:2], z[None]), box) for z in lines[2])
+        met = torch.cat([ends for ends in slices if len(ends)] or [torch.empty(0, 3)]).unbind(-1)
+    if not all(len(m) for m in met):
+        return None
+    return tuple(range(int(m.min()), int(m.max()) + 1) for m in met)  # type: ignore[return-value]
+
+
+def _within(geometry: Geometry, voxels: Tensor, box: Tensor) -> Tensor:
+    """The least and the greatest coordinates (2, 3) of the voxels (M, 3) within a box of the world; or none."""
+    world = geometry.to_world(voxels)
+    inside = voxels[((world >= box[0]) & (world <= box[1])).all(-1)]
+    return torch.stack(inside.aminmax(dim=0)) if len(inside) else inside
+
+
+def _corner(name: str, corner: Sequence[float] | Array) -> tuple[float, float, float]:
+    values = np.asarray(as_tensor(corner), dtype=np.float64)
+    if values.shape != (3,) or np.isnan(values).any():
+        raise ValueError(f"{name} must be three numbers in x, y, z order; got {corner!r}")
+    return tuple(values.tolist())  # type: ignore[return-value]
+
+
+def _checked_samples(samples: Array) -> Tensor:
+    samples = as_tensor(samples)
     if not isinstance(samples, Tensor):
-        raise TypeError(f"samples must be a torch.Tensor; got {type(samples).__name__}")
+        raise TypeError(f"samples must be a torch.Tensor or a NumPy array; got {type(samples).__name__}")
     if samples.ndim not in (3, 5):
         raise ValueError(f"samples must have shape (D, H, W) or (N, C, D, H, W); got {tuple(samples.shape)}")
     if 0 in samples.shape[-3:]:
@@ -275,22 +413,23 @@ def exact_float(samples: Tensor) -> torch.dtype:
     return torch.float64 if max(-least, most) > 2**24 else torch.float32
 
 
-def as_volume(volume: Volume | Tensor) -> Volume:
-    """A `Volume` as it is; a bare tensor with voxel centres at the integers. Raises TypeError for anything else."""
-    if not isinstance(volume, Volume | Tensor):
-        raise TypeError(f"expected a Volume or a torch.Tensor; got {type(volume).__name__}")
+def as_volume(volume: Volume | Array) -> Volume:
+    """A `Volume` as it is; bare samples with voxel centres at the integers. Raises TypeError for anything else."""
+    if not isinstance(volume, Volume | Array):
+        raise TypeError(f"expected a Volume, a torch.Tensor or a NumPy array; got {type(volume).__name__}")
     return volume if isinstance(volume, Volume) else Volume(volume)
 
 
-def from_grid_sample(points: Tensor, shape: Sequence[int], *, align_corners: bool) -> Tensor:
+def from_grid_sample(points: Array, shape: Sequence[int], *, align_corners: bool) -> Tensor:
     """`torch.nn.functional.grid_sample` coordinates in [−1, 1] (x, y, z) to voxel coordinates.
 
     align_corners=True: x = (p+1)/2 · (n−1); False: x = ((p+1) · n − 1)/2. `shape` is (..., D, H, W).
     """
+    points = as_tensor(points)
     n = points.new_tensor([int(k) for k in list(shape)[-3:]][::-1])
     return (points + 1) / 2 * (n - 1) if align_corners else ((points + 1) * n - 1) / 2
 
 
-def from_zyx(points: Tensor) -> Tensor:
+def from_zyx(points: Array) -> Tensor:
     """Points in z, y, x order (as NumPy and scipy index arrays) to x, y, z order."""
-    return points.flip(-1)
+    return as_tensor(points).flip(-1)

@@ -21,6 +21,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = {
     "names": -2,
     "world": -2,
+    "arrays": -1,
     "geometry": -1,
     "forking": 0,
     "volume": 0,

@@ -119,7 +119,7 @@ def test_other_shapes_are_refused(shape) -> None:
 
 
 def test_what_is_no_volume_and_no_shape_is_refused() -> None:
-    with pytest.raises(TypeError, match=r"a Volume, a torch\.Tensor or a shape; got str"):
+    with pytest.raises(TypeError, match=r"a NumPy array or a shape; got str"):
         Reconstruction("triquadratic")  # type: ignore[arg-type]
 
 
@@ -171,6 +171,10 @@ def test_to_converts_what_it_is_made_of() -> None:
     single = copy.deepcopy(module).to(torch.float32)
     assert single.samples.dtype == torch.float32
     assert torch.equal(single(where), fl.reconstruct(placed(4, 5, 6).to(torch.float32), "triquadratic")(where))
+    frozen = copy.deepcopy(module).requires_grad_(False)
+    assert frozen(where.float()).dtype == torch.float32
+    assert frozen.field() is not frozen.to(torch.float32).field()
+    assert torch.equal(frozen(where), single(where))
     assert Reconstruction(placed(4, 5, 6), learnable=False).to(torch.float32)(where.float()).dtype == torch.float32
 
 

@@ -154,7 +154,7 @@ def test_samples_are_kept_and_gradients_flow_back():
         ({"samples": torch.zeros(0, 3, 4)}, ValueError, "voxel"),
         ({"samples": torch.zeros(2, 2, 2, dtype=torch.bool)}, TypeError, "real"),
         ({"samples": torch.zeros(2, 2, 2, dtype=torch.complex64)}, TypeError, "real"),
-        ({"samples": np.zeros((2, 2, 2))}, TypeError, "Tensor"),
+        ({"samples": [[[1.0]]]}, TypeError, "Tensor or a NumPy array"),
         ({"spacing": (1, 0, 1)}, ValueError, "positive"),
         ({"spacing": (1, -1, 1)}, ValueError, "positive"),
         ({"spacing": (1, float("nan"), 1)}, ValueError, "finite"),

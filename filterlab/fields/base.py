@@ -12,6 +12,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 from filterlab.ops.pieces import Pieces
 from filterlab.ops.raycast import Candidates
 from filterlab.ops.reference import raycast
@@ -85,10 +86,11 @@ class Relevant(NamedTuple):
 class Field(ABC):
     """A function of space with value, gradient and (up to `max_order`) higher derivatives.
 
-    Points are world points `(..., 3)` in x, y, z order. An unbatched field maps points `(*P, 3)` to values `(*P)`,
-    gradients `(*P, 3)` and Hessians `(*P, 3, 3)`; a batched one (`channels` is (N, C)) maps points `(N, *P, 3)` to
-    `(N, C, *P)`, `(N, C, *P, 3)` and `(N, C, *P, 3, 3)`. Gradients are per world unit. Everything is computed in
-    promote(points.dtype, float32), and is differentiable in the points and in whatever the field was built from.
+    Points are world points `(..., 3)` in x, y, z order, a tensor or a NumPy array. An unbatched field maps points `(*P,
+    3)` to values `(*P)`, gradients `(*P, 3)` and Hessians `(*P, 3, 3)`; a batched one (`channels` is (N, C)) maps
+    points `(N, *P, 3)` to `(N, C, *P)`, `(N, C, *P, 3)` and `(N, C, *P, 3, 3)`. Gradients are per world unit.
+    Everything is computed in promote(points.dtype, float32), and is differentiable in the points and in whatever the
+    field was built from.
 
     Far from the origin float32 points have lost their digits before a field sees them: a million voxels away they are
     multiples of 1/16 voxel. Give points in float64, or, to compute in float32, measured from a point nearby:
@@ -160,14 +162,14 @@ class Field(ABC):
         return TypeError(f"{type(self).__name__} ({self.scheme.name}) is not piecewise polynomial along rays")
 
     @abstractmethod
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+    def jet(self, points: Array, order: int) -> tuple[Tensor, ...]:
         """(value,), (value, gradient) or (value, gradient, Hessian) for order 0, 1, 2, in one pass."""
 
-    def __call__(self, points: Tensor) -> Tensor:
+    def __call__(self, points: Array) -> Tensor:
         """Values at the points."""
         return self.jet(points, 0)[0]
 
-    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def value_and_gradient(self, points: Array) -> tuple[Tensor, Tensor]:
         """Values and gradients (per world unit) at the points, in one pass."""
         value, gradient = self.jet(points, 1)
         return value, gradient
@@ -242,7 +244,7 @@ class _Selected(Field):
     def device(self) -> torch.device | None:
         return self.field.device
 
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+    def jet(self, points: Array, order: int) -> tuple[Tensor, ...]:
         return tuple(x[self.n, self.c] for x in self.field.jet(points[None], order))
 
 
@@ -258,7 +260,7 @@ class _Relative(Field):
     def device(self) -> torch.device | None:
         return self.field.device
 
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+    def jet(self, points: Array, order: int) -> tuple[Tensor, ...]:
         points = check_points(points, self.channels)
         moved = points.double() + torch.tensor(self.origin, dtype=torch.float64, device=points.device)
         return tuple(row.to(points.dtype) for row in self.field.jet(moved, order))
@@ -277,10 +279,11 @@ def _checked_origin(origin: Sequence[float]) -> tuple[float, float, float]:
 _COMPUTED = torch.float32, torch.float64
 
 
-def check_points(points: Tensor, channels: tuple[int, int] | None) -> Tensor:
+def check_points(points: Array, channels: tuple[int, int] | None) -> Tensor:
     """The points in their compute type, promote(points, float32). Raises on a wrong type or shape."""
+    points = as_tensor(points)
     if not isinstance(points, Tensor):
-        raise TypeError(f"points must be a torch.Tensor; got {type(points).__name__}")
+        raise TypeError(f"points must be a torch.Tensor or a NumPy array; got {type(points).__name__}")
     computed = points.dtype in _COMPUTED
     if not computed and (points.dtype.is_complex or points.dtype == torch.bool):
         raise TypeError(f"points must be real numbers; got {points.dtype}")

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from filterlab import ops
+from filterlab.arrays import Array
 from filterlab.fields.base import Domain, Field, Relevant, check_order, check_points, type_of_rays
 from filterlab.fields.ranges import ranges, straddling
 from filterlab.fields.storage import Quantization, stored_as
@@ -356,7 +357,7 @@ class GridField(Field):
         if self.degree_along_rays is None:
             raise self.no_pieces()
 
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+    def jet(self, points: Array, order: int) -> tuple[Tensor, ...]:
         check_order(order, self.max_order)
         points = check_points(points, self.channels)
         if self.channels is None:

@@ -10,8 +10,8 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
 
+from filterlab.arrays import Array
 from filterlab.fields.base import Field
 from filterlab.methods import METHODS, reconstruct
 from filterlab.missing_values import resolved
@@ -115,13 +115,13 @@ class Recommendation(Question):
         rest = [c for c in self.candidates if c is not self.chosen and (not within or self.fits(c))]
         return (rest if within else sorted(rest, key=lambda c: c.error.high))[:number]
 
-    def field(self, volume: Volume | Tensor) -> Field:
+    def field(self, volume: Volume | Array) -> Field:
         """The chosen field of the volume."""
         return reconstruct(volume, boundary=self.boundary, nan=self.nan, **self.chosen.options())
 
 
 def recommend(
-    volume: Volume | Tensor,
+    volume: Volume | Array,
     max_error: float,
     *,
     task: str = "resample",

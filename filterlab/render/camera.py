@@ -16,13 +16,14 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 from filterlab.fields.base import Domain, Field
 from filterlab.geometry import times_matrix
 from filterlab.ops.reference.optics import Table
 from filterlab.render import suggestion
 from filterlab.render.transfer import TransferFunction
 
-Vector = Sequence[float] | Tensor
+Vector = Sequence[float] | Array
 Window = tuple[float, float, float, float]
 WHOLE: Window = (0.0, 0.0, 1.0, 1.0)
 
@@ -268,7 +269,7 @@ def check_size(size: Sequence[int]) -> tuple[int, int]:
 
 
 def _vector(value: Vector | float, device: torch.device | None = None) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64, device=device)
+    return torch.as_tensor(as_tensor(value), dtype=torch.float64, device=device)
 
 
 def _number(expected: str, value: float | Tensor) -> float:

@@ -21,16 +21,15 @@ from torch.utils.checkpoint import checkpoint
 from filterlab.fields.base import Domain, Field
 from filterlab.ops.march import Chords
 from filterlab.ops.reference.march import rays_at_once
-from filterlab.render.camera import Camera
 from filterlab.render.fused import FusedMarcher, why_not_fused
 from filterlab.render.image import (
     CENTER,
     Canvas,
     PixelRays,
     Progress,
-    RayTensors,
+    View,
+    as_view,
     check_background,
-    check_camera,
     check_field,
     device_of,
     over,
@@ -55,7 +54,7 @@ _DEFAULT = Sampling()
 
 def render(
     field: Field,
-    camera: Camera | RayTensors,
+    camera: View,
     transfer: TransferFunction,
     *,
     size: Sequence[int] | None = None,
@@ -141,7 +140,7 @@ def render(
 
 def prepare(
     field: Field,
-    camera: Camera | RayTensors,
+    camera: View,
     transfer: TransferFunction,
     *,
     size: Sequence[int] | None = None,
@@ -152,7 +151,8 @@ def prepare(
     device: torch.device | str | None = None,
 ) -> Frame:
     """All that `render` decides before it marches; arguments and errors are those of `render`."""
-    _check_arguments(field, camera, transfer, shading)
+    camera = as_view(camera)
+    _check_arguments(field, transfer, shading)
     asked = sampling.step_in(field.domain.voxel_size)
     device = torch.device(device or device_of(camera) or transfer.positions.device)
     seen = PixelRays.of(camera, size, device)
@@ -305,11 +305,8 @@ def _count(cut: Cut, seen: PixelRays, parts: Sequence[_Part]) -> float:
     return total
 
 
-def _check_arguments(
-    field: Field, camera: Camera | RayTensors, transfer: TransferFunction, shading: Shading | None
-) -> None:
+def _check_arguments(field: Field, transfer: TransferFunction, shading: Shading | None) -> None:
     check_field(field)
-    check_camera(camera)
     if not isinstance(transfer, TransferFunction):
         raise TypeError(f"transfer must be a TransferFunction; got {type(transfer).__name__}")
     if not isinstance(shading, Shading | None):

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 from filterlab.fields.base import Field
 from filterlab.ops.reference.optics import absorbed
 from filterlab.render.camera import Camera, check_size
@@ -24,6 +25,9 @@ from filterlab.render.tiles import tiled_part
 
 RayTensors = tuple[Tensor, Tensor]
 """Origins and directions, (..., 3) each."""
+
+View = Camera | RayTensors | tuple[Array, Array]
+"""What a renderer is given: a camera, or rays as tensors or NumPy arrays."""
 
 Place = tuple[Tensor | float, Tensor | float]
 CENTER = (0.5, 0.5)
@@ -45,11 +49,14 @@ def check_field(field: Field) -> None:
         raise ValueError(f"field.domain.voxel_size must be a positive world length; got {field.domain.voxel_size}")
 
 
-def check_camera(camera: Camera | RayTensors) -> None:
-    """Raises TypeError unless it is a camera, or two tensors."""
-    pair = isinstance(camera, tuple | list) and len(camera) == 2 and all(isinstance(r, Tensor) for r in camera)
-    if not (isinstance(camera, Camera) or pair):
+def as_view(camera: View) -> Camera | RayTensors:
+    """A camera as it is, or the two tensors of rays. Raises TypeError for anything else."""
+    if isinstance(camera, Camera):
+        return camera
+    if not (isinstance(camera, tuple | list) and len(camera) == 2 and all(isinstance(r, Array) for r in camera)):
         raise TypeError(f"camera must be a Camera or two tensors (origins, directions); got {type(camera).__name__}")
+    origins, directions = camera
+    return as_tensor(origins), as_tensor(directions)
 
 
 def device_of(camera: Camera | RayTensors) -> torch.device | None:
@@ -127,7 +134,7 @@ def _one_by_one(device: torch.device) -> Callable[[range], Tensor]:
 def check_background(background: Sequence[float] | Tensor, device: torch.device) -> Tensor:
     """Linear RGB (3,) float64. Raises ValueError unless it is three finite numbers ≥ 0."""
     try:
-        color = torch.as_tensor(background, dtype=torch.float64, device=device)
+        color = torch.as_tensor(as_tensor(background), dtype=torch.float64, device=device)
     except (TypeError, ValueError, ArithmeticError, RuntimeError):
         color = torch.empty(0)
     if color.shape != (3,) or not color.detach().isfinite().all() or (color.detach() < 0).any():

@@ -15,12 +15,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 from filterlab.fields.base import Field
 from filterlab.ops.reference.optics import dot, safe_normalize
 from filterlab.render.shading import Light, Shading
 from filterlab.render.transfer import TransferFunction
 
-Color = Sequence[float] | Tensor
+Color = Sequence[float] | Array
 Visibility = Callable[[Light], Tensor | None]
 """How much of a light reaches each point, (R,) in 0 … 1; None: all of it, everywhere."""
 
@@ -58,7 +59,7 @@ class Uniform:
     order = 1
 
     def __call__(self, seen: Seen) -> Tensor:
-        return torch.as_tensor(self.color, dtype=seen.point.dtype, device=seen.point.device).expand_as(seen.point)
+        return _like(self.color, seen.point).expand_as(seen.point)
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class Triplanar:
         size: world edge of one tile; it repeats.
     """
 
-    texture: Tensor
+    texture: Array
     size: float = 1.0
     order = 1
 
@@ -214,11 +215,11 @@ class ReflectionLines(Material):
 
     def __call__(self, seen: Seen, lights: Sequence[Light]) -> Tensor:
         r = seen.reflected
-        axis = safe_normalize(torch.as_tensor(self.axis, dtype=r.dtype, device=r.device))
+        axis = safe_normalize(_like(self.axis, r))
         first, second = _across(axis)
         angle = torch.atan2(dot(r, second), dot(r, first))
         stripe = 0.5 + 0.5 * torch.tanh(self.sharpness * torch.sin(self.count * angle))
-        bright, dark = (torch.as_tensor(c, dtype=r.dtype, device=r.device) for c in (self.bright, self.dark))
+        bright, dark = _like(self.bright, r), _like(self.dark, r)
         return torch.lerp(dark, bright, stripe[:, None])
 
 
@@ -233,7 +234,7 @@ class Environment(Material):
         color: of the surface itself.
     """
 
-    picture: Tensor | None = None
+    picture: Array | None = None
     color: Color | Coloring = (0.2, 0.2, 0.22)
     reflectivity: float = 0.4
     opacity: float = 1.0
@@ -302,7 +303,7 @@ class Toon(Material):
             facing = dot(seen.normal, toward).abs()
             visible = seen.visibility(source)
             facing = facing if visible is None else facing * visible
-            tint = torch.as_tensor(source.color, dtype=light.dtype, device=light.device)
+            tint = _like(source.color, light)
             light = light + tint * (torch.ceil(facing * self.bands) / self.bands)[:, None]
         color = _coloring(self.color)(seen) * (self.ambient + (1 - self.ambient) * light)
         return torch.where(self._contour(seen)[:, None], _like(self.ink, color), color) if self.contour else color
@@ -323,10 +324,10 @@ def _coloring(color: Color | Coloring) -> Coloring:
 # --- pictures and directions ------------------------------------------------------------------------------------------
 
 
-def _looked_up(picture: Tensor, u: Tensor, v: Tensor, wrapped: bool) -> Tensor:
+def _looked_up(picture: Array, u: Tensor, v: Tensor, wrapped: bool) -> Tensor:
     """Linear interpolation in a picture (H, W, 3) at u, v in 0 … 1 (across, down); u goes round, v too if `wrapped`."""
     height, width = picture.shape[:2]
-    picture = picture.to(u)
+    picture = as_tensor(picture).to(u)
     x, y = u * width - 0.5, v * height - 0.5
     left, top = x.floor(), y.floor()
     columns = [(left.long() + k) % width for k in range(2)]
@@ -354,7 +355,7 @@ def _across(axis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _like(color: Color, example: Tensor) -> Tensor:
-    return torch.as_tensor(color, dtype=example.dtype, device=example.device)
+    return torch.as_tensor(as_tensor(color), dtype=example.dtype, device=example.device)
 
 
 def _check_opacity(opacity: float) -> None:
@@ -363,12 +364,13 @@ def _check_opacity(opacity: float) -> None:
 
 
 def _check_direction(name: str, vector: Sequence[float]) -> None:
-    given = torch.as_tensor(vector, dtype=torch.float64)
+    given = torch.as_tensor(as_tensor(vector), dtype=torch.float64)
     if given.shape != (3,) or not given.isfinite().all() or not given.any():
         raise ValueError(f"{name} must be three finite numbers, not all zero; got {vector!r}")
 
 
-def _check_picture(name: str, picture: Tensor) -> None:
+def _check_picture(name: str, picture: Array) -> None:
+    picture = as_tensor(picture)
     if not isinstance(picture, Tensor) or picture.ndim != 3 or picture.shape[-1] != 3 or 0 in picture.shape:
         raise ValueError(
             f"{name} must be a picture (H, W, 3) of linear RGB; got {tuple(getattr(picture, 'shape', ()))}"

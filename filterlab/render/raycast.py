@@ -21,9 +21,9 @@ from filterlab.render.image import (
     PixelRays,
     Place,
     Progress,
-    RayTensors,
+    View,
+    as_view,
     check_background,
-    check_camera,
     device_of,
     reporting,
 )
@@ -132,7 +132,7 @@ def _depth(origins: Tensor, directions: Tensor, at: SurfacePoints, hits: Hits) -
 
 def raycast(
     surface: Surface,
-    camera: Camera | RayTensors,
+    camera: View,
     material: Material | None = None,
     *,
     size: Sequence[int] | None = None,
@@ -182,9 +182,9 @@ def raycast(
             out of range, channels that are not known, more than one ray a pixel for other channels than the colour,
             silhouettes of rays without a camera.
     """
+    camera = as_view(camera)
     _check(surface, material, sheets, subpixels, channels, dtype, camera)
     _check_silhouettes(silhouettes, surface, camera)
-    check_camera(camera)
     device = torch.device(device or device_of(camera) or "cpu")
     seen = PixelRays.of(camera, size, device)
     asked = ("color",) if channels is None else tuple(channels)

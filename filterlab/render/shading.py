@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 from filterlab.ops.reference.optics import dot, power, safe_normalize
 
 
@@ -26,8 +27,8 @@ class Light:
     Both may be tensors that require grad.
     """
 
-    direction: Sequence[float] | Tensor | None = None
-    color: Sequence[float] | Tensor = (1.0, 1.0, 1.0)
+    direction: Sequence[float] | Array | None = None
+    color: Sequence[float] | Array = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
         if self.direction is not None:
@@ -148,7 +149,7 @@ def _plain(value: float | Tensor) -> float:
     return float(value.detach() if isinstance(value, Tensor) else value)
 
 
-def _checked(name: str, expected: str, value: Sequence[float] | float | Tensor) -> Tensor:
+def _checked(name: str, expected: str, value: Sequence[float] | float | Array) -> Tensor:
     """The value as float64. Raises ValueError that says what was expected."""
     try:
         return _numbers(value)
@@ -156,9 +157,9 @@ def _checked(name: str, expected: str, value: Sequence[float] | float | Tensor) 
         raise ValueError(f"{name} must be {expected}; got {value!r}") from None
 
 
-def _numbers(value: Sequence[float] | float | Tensor) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64)
+def _numbers(value: Sequence[float] | float | Array) -> Tensor:
+    return torch.as_tensor(as_tensor(value), dtype=torch.float64)
 
 
-def _like(value: Sequence[float] | float | Tensor, example: Tensor) -> Tensor:
-    return torch.as_tensor(value, dtype=example.dtype, device=example.device)
+def _like(value: Sequence[float] | float | Array, example: Tensor) -> Tensor:
+    return torch.as_tensor(as_tensor(value), dtype=example.dtype, device=example.device)

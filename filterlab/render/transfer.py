@@ -11,6 +11,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 from filterlab.fields.base import Field
 from filterlab.geometry import times_matrix
 from filterlab.io.images import from_srgb
@@ -18,7 +19,7 @@ from filterlab.ops.reference.optics import Table
 from filterlab.render import suggestion
 from filterlab.render.colormaps import encoded_entries
 
-Numbers = Sequence[float] | Tensor
+Numbers = Sequence[float] | Array
 Peak = tuple[float | Tensor, float | Tensor, float | Tensor, Numbers]
 
 
@@ -46,7 +47,7 @@ class TransferFunction(Table):
         ValueError: wrong shapes, not increasing, out of range, not finite.
     """
 
-    def __init__(self, positions: Numbers, colors: Sequence[Numbers] | Tensor, opacities: Numbers, unit: float = 1.0):
+    def __init__(self, positions: Numbers, colors: Sequence[Numbers] | Array, opacities: Numbers, unit: float = 1.0):
         tables = _table("positions", positions), _table("colors", colors), _table("opacities", opacities)
         super().__init__(*tables, _unit(unit))
         _check_tables(self)
@@ -68,7 +69,7 @@ class TransferFunction(Table):
             raise ValueError(f"peaks must be one or more (center, width, height, rgb); got {peaks!r}")
         centers, halves, heights = (torch.stack([_scalar(peak[k]) for peak in peaks]) for k in range(3))
         halves = halves / 2
-        colors = torch.stack([torch.as_tensor(peak[3], dtype=torch.float64) for peak in peaks])
+        colors = torch.stack([torch.as_tensor(as_tensor(peak[3]), dtype=torch.float64) for peak in peaks])
         if not (halves.detach() > 0).all():
             raise ValueError(f"peak widths must be positive; got {(2 * halves).tolist()}")
         x = torch.cat((centers - halves, centers, centers + halves)).sort().values
@@ -150,8 +151,9 @@ class TransferFunction(Table):
         _check_tables(out)  # again: an optimizer may have moved them since
         return out
 
-    def __call__(self, value: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, value: Array) -> tuple[Tensor, Tensor]:
         """(linear RGB `(..., 3)`, opacity per unit `(...)`) of values `(...)`, in promote(value, float32)."""
+        value = as_tensor(value).contiguous()  # torch warns of what it makes contiguous by itself
         value = value.to(torch.promote_types(value.dtype, torch.float32))
         function = self.to(value.dtype, value.device)
         unknown = value.detach().isnan()
@@ -161,7 +163,7 @@ class TransferFunction(Table):
 
 
 def _scalar(value: Numbers | float) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64).reshape(())
+    return torch.as_tensor(as_tensor(value), dtype=torch.float64).reshape(())
 
 
 def _unit(value: float) -> float:
@@ -171,9 +173,9 @@ def _unit(value: float) -> float:
         raise ValueError(f"unit must be a positive world length; got {value!r}") from None
 
 
-def _table(name: str, values: Sequence | Tensor) -> Tensor:
+def _table(name: str, values: Sequence | Array) -> Tensor:
     try:
-        return values if isinstance(values, Tensor) else torch.as_tensor(values, dtype=torch.float64)
+        return values if isinstance(values, Tensor) else torch.as_tensor(as_tensor(values), dtype=torch.float64)
     except (TypeError, ValueError, ArithmeticError, RuntimeError):
         raise ValueError(f"{name} must be numbers; got {values!r}") from None
 

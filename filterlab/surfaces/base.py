@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array, as_tensor
 from filterlab.fields.base import Domain, check_order, type_of_rays
 from filterlab.ops.differentiable.recording import transforming
 
@@ -134,7 +135,7 @@ class Surface(ABC):
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
         """The first hits (R, sheets) in order, or the last ones from the last on."""
 
-    def hit(self, origins: Tensor, directions: Tensor) -> Hits:
+    def hit(self, origins: Array, directions: Array) -> Hits:
         """The first hit of every ray in the domain, t ≥ 0.
 
         Args:
@@ -150,11 +151,11 @@ class Surface(ABC):
         origins, directions = check_rays(origins, directions)
         return self._attached(self._searched(origins, directions), origins, directions)
 
-    def met(self, origins: Tensor, directions: Tensor) -> Tensor:
+    def met(self, origins: Array, directions: Array) -> Tensor:
         """Whether rays hit it at all, (...) bool; arguments and errors as for `hit`. Nothing is recorded."""
         return self._searched(*check_rays(origins, directions)).valid
 
-    def hits(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool = False) -> Hits:
+    def hits(self, origins: Array, directions: Array, sheets: int, farthest: bool = False) -> Hits:
         """The first `sheets` hits of every ray in order; the last ones, from the last on, where `farthest`.
 
         Args:
@@ -173,7 +174,7 @@ class Surface(ABC):
         found = self.detached._sheets(o, d, sheets, farthest).of_rays((*origins.shape[:-1], sheets), origins.dtype)
         return self._attached(found, origins[..., None, :], directions[..., None, :])
 
-    def at(self, origins: Tensor, directions: Tensor, hit: Hits, order: int = 1) -> SurfacePoints:
+    def at(self, origins: Array, directions: Array, hit: Hits, order: int = 1) -> SurfacePoints:
         """What is known of the surface at hits.
 
         Args:
@@ -341,8 +342,9 @@ def check_sheets(sheets: int) -> None:
         raise ValueError(f"sheets must be an integer from 1 to {MAX_SHEETS}; got {sheets!r}")
 
 
-def check_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+def check_rays(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     """Both (..., 3), broadcast, in promote(origins, directions, float32). Raises what `Surface.hit` says."""
+    origins, directions = as_tensor(origins), as_tensor(directions)
     rays = _broadcast(origins, directions)
     for name, x in (("origins", origins), ("directions", directions)):
         if not _all_finite(x.detach()):
@@ -354,23 +356,24 @@ def check_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     return rays
 
 
-def _broadcast(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+def _broadcast(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     """The same; whatever their numbers are."""
+    origins, directions = as_tensor(origins), as_tensor(directions)
     for name, x in (("origins", origins), ("directions", directions)):
         if not isinstance(x, Tensor) or not x.dtype.is_floating_point:
             found = x.dtype if isinstance(x, Tensor) else type(x).__name__
-            raise TypeError(f"{name} must be a floating-point torch.Tensor; got {found}")
+            raise TypeError(f"{name} must be a floating-point torch.Tensor or NumPy array; got {found}")
         if x.ndim == 0 or x.shape[-1] != 3:
             raise ValueError(f"{name} must have shape (..., 3) in x, y, z order; got {tuple(x.shape)}")
     dtype = type_of_rays(origins, directions)
     try:
-        origins, directions = torch.broadcast_tensors(origins.to(dtype), directions.to(dtype))
+        o, d = torch.broadcast_tensors(origins.to(dtype), directions.to(dtype))
     except RuntimeError:
         raise ValueError(
             "origins and directions must have shapes (..., 3) that broadcast; "
             f"got {tuple(origins.shape)} and {tuple(directions.shape)}"
         ) from None
-    return origins, directions
+    return o, d
 
 
 def _all_finite(x: Tensor) -> bool:
