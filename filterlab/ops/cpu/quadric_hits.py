@@ -240,8 +240,8 @@ class _Program:
         return [e.load(e.advance(base, I64(WIDTH * row), DOUBLE), DOUBLE, WIDTH) for row in rows]
 
     def _dot(self, x: Sequence[Value], y: Sequence[Value]) -> Value:
-        total = None
-        for a, b in zip(x, y, strict=True):
+        total = self.lanes.multiply(x[0], y[0])
+        for a, b in zip(x[1:], y[1:], strict=True):
             total = self.lanes.multiply_add(a, b, total)
         return total
 
