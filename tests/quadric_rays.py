@@ -203,10 +203,11 @@ def verdict(quadric: str, rays: str, count: int, seed: int) -> dict[str, int]:
 
 def main(seconds: float) -> None:
     totals: dict[str, dict[str, int]] = {}
-    end = time.monotonic() + seconds
-    for seed, quadric, rays in itertools.product(itertools.count(1000), QUADRICS, RAYS):
+    kinds, end = list(itertools.product(QUADRICS, RAYS)), time.monotonic() + seconds
+    for number in itertools.count():
+        quadric, rays = kinds[number % len(kinds)]
         own = totals.setdefault(quadric, {})
-        for name, n in (verdict(quadric, rays, 50, seed) | {"rays": 50}).items():
+        for name, n in (verdict(quadric, rays, 50, 1000 + number) | {"rays": 50}).items():
             own[name] = own.get(name, 0) + n
         if time.monotonic() > end:
             break

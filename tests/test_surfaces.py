@@ -491,7 +491,10 @@ def test_directions_may_have_any_length():
 
 
 def test_surfaces_are_public():
-    assert set(surfaces.__all__) == {"Hits", "LevelSet", "Mesh", "Surface", "SurfacePoints", "mesh"}
+    bounds = {"Bounds", "Planes", "Spheres", "Tetrahedra"}
+    assert (
+        set(surfaces.__all__) == {"Hits", "LevelSet", "Mesh", "Quadrics", "Surface", "SurfacePoints", "mesh"} | bounds
+    )
 
 
 def test_a_level_and_samples_that_change_in_place_are_seen() -> None:
