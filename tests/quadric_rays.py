@@ -5,6 +5,7 @@ python -m tests.quadric_rays 600        for so many seconds; prints what was mis
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 from collections.abc import Callable
@@ -202,14 +203,14 @@ def verdict(quadric: str, rays: str, count: int, seed: int) -> dict[str, int]:
 
 def main(seconds: float) -> None:
     totals: dict[str, dict[str, int]] = {}
-    end, seed = time.monotonic() + seconds, 1000
-    while time.monotonic() < end:
-        for quadric in QUADRICS:
-            for rays in RAYS:
-                for name, n in (verdict(quadric, rays, 50, seed) | {"rays": 50}).items():
-                    own = totals.setdefault(quadric, {})
-                    own[name] = own.get(name, 0) + n
-        seed += 1
+    kinds, end = list(itertools.product(QUADRICS, RAYS)), time.monotonic() + seconds
+    for number in itertools.count():
+        quadric, rays = kinds[number % len(kinds)]
+        own = totals.setdefault(quadric, {})
+        for name, n in (verdict(quadric, rays, 50, 1000 + number) | {"rays": 50}).items():
+            own[name] = own.get(name, 0) + n
+        if time.monotonic() > end:
+            break
     for quadric, total in totals.items():
         print(quadric, total)
 

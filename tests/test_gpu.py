@@ -14,7 +14,7 @@ from filterlab.ops.differentiable.prefilter import implementation_for, prefilter
 from filterlab.prefilters import PREFILTERS
 from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.roots import all_roots, first_root
-from filterlab.surfaces import LevelSet
+from filterlab.surfaces import LevelSet, Quadrics
 from filterlab.volume import Boundary, Volume
 from tests.test_methods import TENSOR_PRODUCTS
 from tests.tetrahedral_oracle import SPLINES
@@ -177,3 +177,25 @@ def test_hits_and_their_derivatives(method: str, dtype: torch.dtype) -> None:
             a, b = a[~other], b[~other]
         limit = (1e-9 if exact else 2e-3) * float(a.detach().abs().max())
         torch.testing.assert_close(b, a, rtol=0, atol=limit, msg=lambda t, name=name: f"{name}: {t}")
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+def test_quadrics(dtype: torch.dtype) -> None:
+    """In plain torch, where it is not the CPU."""
+    rng = torch.Generator().manual_seed(2)
+    centers, radii = 5 * torch.rand(300, 3, generator=rng).double(), 0.1 + 0.4 * torch.rand(300, generator=rng).double()
+    origins, ends = (8 * torch.rand(2, 2000, 3, generator=rng).double() - 1.5).to(dtype)
+    found = []
+    for device in ("cpu", "cuda"):
+        c = centers.to(device).requires_grad_()
+        surface = Quadrics.ellipsoids(c, radii.to(device))
+        o, d = origins.to(device), (ends - origins).to(device)
+        hits = surface.hits(o, d, 3)
+        at = surface.at(o, d, hits)
+        steep = hits.valid & ((at.normal * d[:, None]).sum(-1).abs() > 0.2)
+        (gradient,) = torch.autograd.grad(torch.where(steep, hits.t, 0).sum(), c)
+        found.append((hits.piece, torch.where(hits.valid, hits.t, 0), gradient))
+    (piece, t, gradient), on_gpu = found
+    assert torch.equal(on_gpu[0].cpu(), piece)
+    assert_same(on_gpu[1], t)
+    assert_same(on_gpu[2], gradient)

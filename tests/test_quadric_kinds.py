@@ -72,6 +72,21 @@ def test_boxes_cut_nothing_off(name):
     torch.testing.assert_close(a, b, rtol=1e-12, atol=0)
 
 
+def test_boxes_touch_the_circles_at_the_ends():
+    """No more than what is bounded, and all of it."""
+    angle = torch.linspace(0, 2 * torch.pi, 721, dtype=F64)[:, None, None]
+    way = torch.nn.functional.normalize(ENDS - PLACES, dim=-1)
+    side = torch.nn.functional.normalize(torch.linalg.cross(way, numbers(COUNT, 3, seed=8)), dim=-1)
+    circle = RADII[:, None] * (angle.cos() * side + angle.sin() * torch.linalg.cross(way, side))
+    for name, around in (("cylinders", torch.cat((PLACES + circle, ENDS + circle))), ("cones", ENDS + circle)):
+        around = torch.cat((around, PLACES[None])) if name == "cones" else around
+        boxes = KINDS[name]().bounds.boxes
+        assert (around >= boxes.lower - 1e-12).all()
+        assert (around <= boxes.upper + 1e-12).all()
+        torch.testing.assert_close(around.amin(0), boxes.lower, rtol=0, atol=1e-4)
+        torch.testing.assert_close(around.amax(0), boxes.upper, rtol=0, atol=1e-4)
+
+
 @pytest.mark.parametrize("name", OPEN)
 def test_caps_close_them(name):
     """Lines from outside cross them an even number of times, and the first face is a front."""

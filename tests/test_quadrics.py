@@ -427,7 +427,17 @@ def test_an_image_shows_the_nearest():
     assert 0.1 < float((expected < torch.inf).double().mean()) < 0.9
 
 
-def test_an_image_has_shadows_and_sheets():
+def test_a_region_cuts_what_is_seen():
+    surface = balls()
+    camera = PerspectiveCamera.framing(surface.domain, (0.3, 1.0, -0.4))
+    region = ((-9.0, -9.0, 3.0), (15.0, 15.0, 15.0))
+    shown = raycast(surface, camera, size=(24, 24), channels=("depth", "position"), region=region, dtype=F64)
+    seen = shown["depth"][..., 0] < torch.inf
+    assert int(seen.sum()) > 20
+    assert shown["position"][..., 2][seen].min() > 3 - 1e-9
+
+
+def test_an_image_shows_every_sheet():
     surface = balls()
     camera = PerspectiveCamera.framing(surface.domain, (0.3, 1.0, -0.4))
     counts = raycast(surface, camera, size=(16, 16), sheets=6, channels=("sheets",))["sheets"]

@@ -12,7 +12,7 @@ and β² − αγ loses no digits to the distance of the eye. The ball is |ρ| �
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -71,9 +71,6 @@ class Quadrics:
         """Those of a mask (M,); they keep their numbers, and hits with them every bit."""
         rows = self.leaves.transpose(1, 2).flatten(0, 1)[: len(self.tree.order)]
         return Quadrics(self.tree.some(kept), in_leaves(rows[kept[self.tree.order]], torch.nan), self.faces)
-
-    def to(self, device: torch.device) -> Quadrics:
-        return replace(self, tree=self.tree.to(device), leaves=self.leaves.to(device))
 
     @property
     def planes(self) -> int:

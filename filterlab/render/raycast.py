@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.reference.optics import dot
-from filterlab.render.camera import Camera, PerspectiveCamera
+from filterlab.render.camera import Camera
 from filterlab.render.image import (
     CENTER,
     Canvas,
@@ -45,7 +45,7 @@ _FRONTAL = (Light(),)
 
 @dataclass(frozen=True)
 class Casting:
-    """What is cast, and how; see `raycast`. In `seen` first hits are looked for, where less than all will do."""
+    """What is cast, and how; see `raycast`."""
 
     surface: Surface
     material: Material
@@ -55,7 +55,6 @@ class Casting:
     sheets: int
     shadows: bool
     dtype: torch.dtype
-    seen: Surface | None = None
 
     def __call__(self, origins: Tensor, directions: Tensor, channels: Sequence[str]) -> Tensor:
         """The channels of rays (R, 3), side by side (R, width)."""
@@ -75,18 +74,17 @@ class Casting:
     def eye(self, seen: PixelRays, channels: Sequence[str]) -> Eye:
         """The same, for finding edges in those channels; in float64, or both sides of one would be the same ray."""
         exact = replace(self, dtype=torch.float64)
-        counting = replace(exact, seen=None, sheets=COUNTED)
+        counting = replace(exact, sheets=COUNTED)
         radiance = lambda o, d: exact(o, d, channels)  # noqa: E731
         return Eye(self.surface, self.region, seen.rays, lambda inside: counting._hits(inside).t, radiance)
 
     def _hits(self, inside: Spans) -> Hits:
         """Those within the spans: t (R, k) from where rays enter."""
         entry, direction = (x.to(self.dtype) for x in (inside.entry, inside.direction))
-        surface = self.seen or self.surface
         if self.sheets == 1:
-            hits = surface.hit(entry, direction).as_sheets()
+            hits = self.surface.hit(entry, direction).as_sheets()
         else:
-            hits = surface.hits(entry, direction, self.sheets)
+            hits = self.surface.hits(entry, direction, self.sheets)
         length = inside.length.detach().to(self.dtype)[:, None]
         slack = 8 * torch.finfo(self.dtype).eps * self.surface.domain.diagonal
         return hits.where((length > 0) & (hits.t.detach() <= length + slack))
@@ -197,7 +195,6 @@ def raycast(
         sheets,
         shadows,
         dtype,
-        _seen(surface, camera, sheets),
     )
     at_once = max(sheets, silhouettes.lines * silhouettes.parts if silhouettes else 1)
     canvas = Canvas(seen, None, torch.is_grad_enabled(), sum(CHANNELS[name] for name in asked))
@@ -213,13 +210,6 @@ def raycast(
         return image
     widths = [CHANNELS[name] for name in asked]
     return dict(zip(asked, image.split(widths, -1), strict=True))
-
-
-def _seen(surface: Surface, camera: Camera | RayTensors, sheets: int) -> Surface | None:
-    """What is left of a surface for first hits of rays from one eye."""
-    if sheets > 1 or not isinstance(camera, PerspectiveCamera):
-        return None
-    return surface.seen_from(torch.as_tensor(camera.position, dtype=torch.float64).detach())
 
 
 def _mean(

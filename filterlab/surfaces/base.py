@@ -123,10 +123,6 @@ class Surface(ABC):
         """The same surface, made of others in place of `tensors`."""
         raise TypeError(f"{type(self).__name__} cannot tell its tensors")
 
-    def seen_from(self, eye: Tensor) -> Surface:
-        """What has the same first hits for all rays from a world point (3,), and may be cast sooner."""
-        return self
-
     @abstractmethod
     def _first(self, origins: Tensor, directions: Tensor) -> Hits:
         """The first hits (...) of rays (..., 3)."""

@@ -20,13 +20,14 @@ from types import SimpleNamespace
 from llvmlite import ir
 
 from filterlab.ops.cpu import frame, job
-from filterlab.ops.cpu.lanes import DOUBLE, FLOAT, I8, I32, I64, Lanes, Value
+from filterlab.ops.cpu.lanes import DOUBLE, FLOAT, I1, I8, I32, I64, Lanes, Value
 from filterlab.ops.quadrics import CENTER, CONSTANT, MATRIX, PLANES, ROUNDINGS, SIZES, SMALLEST, SQUARE, VECTOR, Kept
 from filterlab.ops.tree import WIDTH
 
 RAYS_OF_A_CHUNK = 128
 _DEEPEST = 12  # levels of nodes, of 8¹² leaves
 _EPS = 2.0**-52
+_MASK = ir.VectorType(I1, WIDTH)
 
 # Arrays are contiguous; R rays, k sheets, d a double.
 FIELDS: dict[str, type] = {
@@ -194,12 +195,10 @@ class _Program:
         sign = b.select(b.icmp_signed("<", child, I32(0)), I32(-1), I32(1))
         self.bits.value = b.bitcast(met, I8)
         with f.repeat_while(lambda: b.icmp_unsigned("!=", self.bits.value, I8(0))):
-            left = f.where(
-                b.bitcast(self.bits.value, ir.VectorType(ir.IntType(1), WIDTH)), near, f.constant(float("-inf"))
-            )
+            left = f.where(b.bitcast(self.bits.value, _MASK), near, f.constant(float("-inf")))
             most = self._greatest(left)
             lanes = b.and_(b.bitcast(b.fcmp_ordered("==", left, f.everywhere(most)), I8), self.bits.value)
-            lane = b.cttz(lanes, ir.IntType(1)(0))
+            lane = b.cttz(lanes, I1(0))
             self._push(b.add(child, b.mul(sign, b.zext(lane, I32))), most)
             self.bits.value = b.xor(self.bits.value, b.shl(I8(1), lane))
 
@@ -231,7 +230,7 @@ class _Program:
         with b.if_then(e.any(valid)):
             front, back, one = self._roots(ray, base, q, far if self.variant.reversed else near)
             kept = self.variant.kept
-            yes = lambda flag: ir.Constant(one.type, [flag] * WIDTH)  # noqa: E731
+            yes = lambda flag: ir.Constant(_MASK, [flag] * WIDTH)  # noqa: E731
             counts = b.select(one, yes(kept.touches), yes(kept.falls)), b.select(one, yes(False), yes(kept.rises))
             for root, counted in zip((front, back), counts, strict=True):
                 within = b.and_(b.fcmp_ordered(">=", root, near), b.fcmp_ordered("<=", root, far))
@@ -242,8 +241,8 @@ class _Program:
         return [e.load(e.advance(base, I64(WIDTH * row), DOUBLE), DOUBLE, WIDTH) for row in rows]
 
     def _dot(self, x: Sequence[Value], y: Sequence[Value]) -> Value:
-        total = None
-        for a, b in zip(x, y, strict=True):
+        total = self.lanes.multiply(x[0], y[0])
+        for a, b in zip(x[1:], y[1:], strict=True):
             total = self.lanes.multiply_add(a, b, total)
         return total
 
@@ -318,7 +317,7 @@ class _Program:
         sooner = b.and_(hit, b.fcmp_ordered("<", tau, e.everywhere(self.limit.value)))
         self.bits.value = b.bitcast(sooner, I8)
         with e.repeat_while(lambda: b.icmp_unsigned("!=", self.bits.value, I8(0))):
-            lane = b.cttz(self.bits.value, ir.IntType(1)(0))
+            lane = b.cttz(self.bits.value, I1(0))
             self.bits.value = b.xor(self.bits.value, b.shl(I8(1), lane))
             place = b.add(b.mul(leaf, I64(WIDTH)), b.zext(lane, I64))
             self._insert(ray, b.extract_element(tau, b.zext(lane, I32)), place)
