@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import json
 import os
+import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,44 @@ def _peak() -> float:
     return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)  # bytes on macOS
 
 
+def steadiness(threads: int, voxels: int, size: int, renders: int) -> dict[str, float]:
+    """Seconds of the slowest and the median of so many renders; CPU seconds of one whose threads all share a core.
+
+    A scheduler may put threads on one core, as others want the rest. Whoever waits for them by spinning shows in the
+    CPU time then, whatever else the machine does. `busy`: CPU ÷ wall-clock time; less than `threads` where others work.
+    """
+    import torch
+
+    from benchmarks.scene import marschner_lobb
+
+    torch.set_num_threads(threads)
+    scene = marschner_lobb(voxels, size)
+    field = scene.field("triquadratic", "fused")
+    for _ in range(3):
+        scene.image(field)
+    times = [_seconds(scene.image, field) for _ in range(renders)]
+    wall = statistics.median(t for t, _ in times)
+    found = {
+        "slowest": max(t for t, _ in times),
+        "median": wall,
+        "busy": sum(cpu for _, cpu in times) / sum(t for t, _ in times),
+    }
+    if sys.platform == "linux":
+        for task in os.listdir("/proc/self/task"):
+            os.sched_setaffinity(int(task), {min(os.sched_getaffinity(0))})
+        found["packed"] = statistics.median(_seconds(scene.image, field)[1] for _ in range(5))
+        torch.set_num_threads(1)
+        found["alone"] = statistics.median(_seconds(scene.image, field)[1] for _ in range(5))
+    return found
+
+
+def _seconds(call: Callable[..., object], *arguments: object) -> tuple[float, float]:
+    """Of the wall clock, and of the CPU."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    call(*arguments)
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
 def first_call(methods: list[str]) -> dict[str, float]:
     """Seconds of the first value and gradient of each fused kernel, one after the other, and of another of the last."""
     import torch
@@ -117,5 +156,5 @@ def first_call(methods: list[str]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    probes = {"memory": memory, "casting_memory": casting_memory, "first_call": first_call}
+    probes = {f.__name__: f for f in (memory, casting_memory, steadiness, first_call)}
     print(json.dumps(probes[sys.argv[1]](**json.loads(sys.argv[2]))))

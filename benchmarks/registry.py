@@ -19,6 +19,7 @@ _NAMES = (
     "surfaces",
     "absent",
     "scaling",
+    "steadiness",
     "startup",
     "gpu",
 )

@@ -55,7 +55,7 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
     """The record of one image."""
     if unit.key == TRUTH:
         field = _truth(config)
-        image, seconds = timed(lambda: config.view.draw(field, run, config.device, config.dtype))
+        image, seconds = config.view.timed(field, run, config.device, config.dtype)
         files = {"image": run.save_image(TRUTH, image), "array": run.save_array(TRUTH, image)}
         return {"kind": TRUTH, **files, "files": list(files.values()), "render_seconds": seconds}
     recipe = next(r for r in config.methods if r.key == unit.key)
@@ -76,7 +76,7 @@ def _image(config: Config, recipe: Recipe, run: Run) -> Record:
         lambda: signal.sample(config.resolution, dtype=torch_dtype(config.dtype), device=config.device),
     )
     field, building = timed(lambda: recipe.build(volume, config.boundary))
-    image, rendering = timed(lambda: config.view.draw(field, run, config.device, config.dtype))
+    image, rendering = config.view.timed(field, run, config.device, config.dtype)
     truth = run.memo("truth:", lambda: run.load_array(run.records[TRUTH]["array"]))
     files = {
         "image": run.save_image(recipe.key, image),

@@ -26,9 +26,10 @@ from experiments.descent import Parameters
 from experiments.members import Members
 from experiments.runs import Record
 from filterlab import kernels, prefilters
-from filterlab.io.config import StrictModel, unknown_name
+from filterlab.io.config import StrictModel
 from filterlab.kernels import PiecewisePolynomial
 from filterlab.methods import from_kernel
+from filterlab.names import unknown_name
 
 FAMILY = "bc"  # the kernels with parameters B and C
 KERNELS = (FAMILY, *fl.KERNELS)

@@ -26,8 +26,8 @@ from experiments.runs import Record, Run, Unit
 from filterlab import bernstein
 from filterlab.bernstein import multi_indices
 from filterlab.fields.tetrahedral import Shape, Spline, Turn, Vector
-from filterlab.io.config import unknown_name
 from filterlab.methods import METHODS, Tetrahedral
+from filterlab.names import unknown_name
 
 SPLINES = {name: method.spline for name, method in METHODS.items() if isinstance(method, Tetrahedral)}
 

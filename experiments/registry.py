@@ -15,7 +15,8 @@ from typing import Any
 from experiments.config import Heading, check_device, config_path, load_heading
 from experiments.report.page import Section
 from experiments.runs import Record, Run, Unit
-from filterlab.io.config import ConfigError, Problem, load_config, unknown_name
+from filterlab.io.config import ConfigError, Problem, load_config
+from filterlab.names import unknown_name
 
 _NAMES = (
     "frequency_response",

@@ -25,7 +25,7 @@ from experiments.exact_roots import BAD, judge
 from experiments.polynomial_families import FAMILIES
 from experiments.runs import Record, Run, Unit
 from filterlab.bernstein import to_monomial
-from filterlab.io.config import unknown_name
+from filterlab.names import unknown_name
 from filterlab.roots import first_root
 
 SOLVERS = ("filterlab", "kornia")

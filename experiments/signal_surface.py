@@ -13,7 +13,7 @@ from torch import Tensor
 
 from filterlab.ops.reference.pieces import inside
 from filterlab.signals import Signal
-from filterlab.surfaces import Surface
+from filterlab.surfaces import Hits, Surface
 
 SAMPLES = 2048  # of the signal along a ray
 BISECTIONS = 60
@@ -35,7 +35,7 @@ class SignalSurface(Surface):
         self.signal, self.level, self.samples = signal, level, samples
         self.domain = signal.domain
 
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+    def jet(self, points: Tensor, order: int, piece: Tensor | None = None) -> tuple[Tensor, ...]:
         value, *derivatives = self.signal.jet(points, order)
         return value - self.level, *derivatives
 
@@ -43,12 +43,12 @@ class SignalSurface(Surface):
     def detached(self) -> SignalSurface:
         return self
 
-    def _first(self, origins: Tensor, directions: Tensor) -> Tensor:
+    def _first(self, origins: Tensor, directions: Tensor) -> Hits:
         lines, ray, start = inside(origins.double(), directions.double(), self.domain.lower, self.domain.upper)
         t, _ = first_crossings(self.signal, self.level, lines.origins, lines.directions, lines.far, self.samples)
-        return torch.full_like(start, math.inf).index_put((ray,), start[ray] + t)
+        return Hits(torch.full_like(start, math.inf).index_put((ray,), start[ray] + t))
 
-    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
+    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
         raise ValueError("a signal's surface is hit first alone; expected sheets=1")
 
 

@@ -15,7 +15,7 @@ from experiments.config import ExperimentConfig, number
 from experiments.extremes import CASES
 from experiments.extremes.contract import Case, Subject
 from experiments.runs import Record, Run, Unit
-from filterlab.io.config import unknown_name
+from filterlab.names import unknown_name
 from filterlab.scenes.model import MethodName
 
 

@@ -31,7 +31,8 @@ from filterlab.fields.determining import Determining, Held
 from filterlab.fields.octahedral import JETS
 from filterlab.fields.tetrahedral_pieces import FieldOnTetrahedra
 from filterlab.fields.type6 import D2, D3
-from filterlab.io.config import ConfigError, Problem, unknown_name
+from filterlab.io.config import ConfigError, Problem
+from filterlab.names import unknown_name
 from filterlab.render.raycast import raycast
 from filterlab.scenes import model as scene
 from filterlab.surfaces import LevelSet

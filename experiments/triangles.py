@@ -77,7 +77,7 @@ class Triangles(Surface):
         nx, ny, _ = self._lattice.cells
         return (cells[:, 2] * ny + cells[:, 1]) * nx + cells[:, 0]
 
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+    def jet(self, points: Tensor, order: int, piece: Tensor | None = None) -> tuple[Tensor, ...]:
         """0, a number without derivatives: triangles are no zeros of a function that has any."""
         if order:
             raise ValueError("triangles have no gradient; ask `at` for normals")
@@ -87,10 +87,10 @@ class Triangles(Surface):
     def detached(self) -> Triangles:
         return self
 
-    def _first(self, origins: Tensor, directions: Tensor) -> Tensor:
-        return self._met(origins, directions).t
+    def _first(self, origins: Tensor, directions: Tensor) -> Hits:
+        return Hits(self._met(origins, directions).t)
 
-    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
+    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
         raise ValueError("triangles are met first ones only; expected sheets=1")
 
     @torch.no_grad()

@@ -10,6 +10,7 @@ from torch import Tensor
 
 import filterlab as fl
 from experiments.config import Dtype, torch_dtype
+from experiments.runs import timed
 from filterlab.fields.base import Domain
 from filterlab.io.config import ConfigError, Problem, StrictModel
 from filterlab.render.dvr import render
@@ -23,6 +24,7 @@ SECONDS_PER_SAMPLE = {"fused": 1e-8, "plain": 3e-7}
 """
 MAX_SAMPLES = 2**34  # of an image: hours of work
 SSIM_WINDOW = 11  # pixels
+_FIRST = (16, 16)  # pixels of an image that nobody looks at
 _PROBE = 96  # pixels along the longer side, by which the samples of an image are estimated
 
 
@@ -124,6 +126,11 @@ class View(StrictModel):
         width, height = self.size
         marcher = "fused" if scheme == "fused" else "plain"
         return width * height * voxels / self.step * SECONDS_PER_SAMPLE[marcher] + 0.2
+
+    def timed(self, field: fl.Field, run: Progress, device: str, dtype: Dtype) -> tuple[Tensor, float]:
+        """The image as of `draw`, and its seconds: not those of what is compiled or made once, at a first image."""
+        self.model_copy(update={"size": _FIRST}).draw(field, Silent(), device, dtype)
+        return timed(lambda: self.draw(field, run, device, dtype))
 
     def draw(self, field: fl.Field, run: Progress, device: str, dtype: Dtype) -> Tensor:
         """The image of a field over the background, linear RGB `(H, W, 3)`, float32, on the CPU."""

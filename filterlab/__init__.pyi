@@ -1,4 +1,4 @@
-from . import costs, io, kernels, metrics, prefilters, render, signals, spectrum
+from . import costs, io, kernels, metrics, nn, prefilters, render, signals, spectrum
 from .fields.base import Field
 from .io.volumes import load_volume, save_volume
 from .kernels import KERNELS
@@ -26,6 +26,7 @@ __all__ = [
     "kernels",
     "load_volume",
     "metrics",
+    "nn",
     "prefilters",
     "recommend",
     "reconstruct",

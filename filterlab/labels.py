@@ -14,7 +14,12 @@ ALIKE = 0.75  # of its neighbours within what is labelled, the share that is equ
 _PLANES = 16
 
 
-def strongest(samples: Tensor, resampled: Callable[[Tensor], Tensor], boundary: Boundary) -> Tensor:
+def strongest(
+    samples: Tensor,
+    resampled: Callable[[Tensor], Tensor],
+    boundary: Boundary,
+    progress: Callable[[float], None] = lambda part: None,
+) -> Tensor:
     """The label whose indicator is greatest after reconstruction: argmax_l R[samples = l], of equal ones the least.
 
     One label after the other: beside the result two numbers per voxel are kept, however many labels there are.
@@ -23,6 +28,7 @@ def strongest(samples: Tensor, resampled: Callable[[Tensor], Tensor], boundary: 
         samples: of any real type; each value is a label. Not differentiable.
         resampled: R, from an indicator (float32, shaped as the samples) to the new grid.
         boundary: beyond `zeros` there is the label 0.
+        progress: told what part of the labels is done.
 
     Raises:
         ValueError: a label that is not finite.
@@ -35,7 +41,8 @@ def strongest(samples: Tensor, resampled: Callable[[Tensor], Tensor], boundary: 
         labels = torch.cat((labels.new_zeros(1), labels)).unique()
     best: Tensor | None = None
     chosen: Tensor | None = None
-    for label in labels.unbind():
+    for index, label in enumerate(labels.unbind()):
+        progress(index / len(labels))
         weight = resampled((samples == label).float())
         if outside and not label.any():  # what is left by all others, which are 0 out there
             weight = 1 - resampled((samples != 0).float())

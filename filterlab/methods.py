@@ -121,6 +121,13 @@ class Method(ABC):
     def build(self, volume: Volume, asked: Asked) -> Field:
         """The field; see `reconstruct`. Raises ValueError for what the method does not offer."""
 
+    def rebuilt(self, field: Field, asked: Asked) -> Field:
+        """A field that it built, of other samples that lie as those did, on the same device; see `build`.
+
+        What does not depend on samples is not asked again.
+        """
+        return self.build(Volume.with_geometry(asked.samples, field.domain.geometry), asked)
+
     def _check_offered(self, scheme: str | None, gradient: str | None) -> None:
         if scheme not in (None, *self.schemes):
             raise ValueError(f"method {self.name} offers the schemes {', '.join(self.schemes)}; got {scheme!r}")
@@ -239,6 +246,11 @@ class TensorProduct(Method):
         coefficients = asked.coefficients(self.prefilter, scheme.reach, _storage_for(self, asked.storage), self.factor)
         return GridField(self.name, volume, coefficients, _that_runs(scheme, coefficients, asked))
 
+    def rebuilt(self, field: Field, asked: Asked) -> Field:
+        assert isinstance(field, GridField)
+        storage = _storage_for(self, asked.storage)
+        return field.with_coefficients(asked.coefficients(self.prefilter, field.scheme.reach, storage, self.factor))
+
 
 @dataclass(frozen=True)
 class Tetrahedral(Method):
@@ -291,6 +303,11 @@ class Tetrahedral(Method):
         scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
         coefficients = asked.coefficients(self.prefilter, scheme.reach, named_storage(asked.storage))
         return FieldOnTetrahedra(self.name, volume, coefficients, _that_runs(scheme, coefficients, asked))
+
+    def rebuilt(self, field: Field, asked: Asked) -> Field:
+        assert isinstance(field, GridField)
+        storage = named_storage(asked.storage)
+        return field.with_coefficients(asked.coefficients(self.prefilter, field.scheme.reach, storage))
 
 
 _FORMER_SCHEMES = {"eight_trilinear": "sampled"}

@@ -4,22 +4,19 @@ A recursive prefilter would carry a NaN along whole lines of the volume. What ha
 becomes a field:
 
     refuse      a ValueError with the number of such voxels (the default)
-    propagate   NaN exactly where the kernel reaches such a voxel; elsewhere as with fill
+    propagate   NaN exactly where the kernel reaches such a voxel; elsewhere as with fill. There media have neither
+                colour nor opacity, and level sets end
     fill        values from the voxels around, by pull-push
 """
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from filterlab.names import NAN_CHOICES
 from filterlab.ops.differentiable.recording import transformed
-
-NanChoice = Literal["refuse", "propagate", "fill"]
-CHOICES: tuple[str, ...] = get_args(NanChoice)
 
 
 def resolved(samples: Tensor, choice: str) -> tuple[Tensor, Tensor | None]:
@@ -31,8 +28,8 @@ def resolved(samples: Tensor, choice: str) -> tuple[Tensor, Tensor | None]:
     Raises:
         ValueError: an unknown choice; with "refuse", how many voxels are not finite; a volume without a finite voxel.
     """
-    if choice not in CHOICES:
-        raise ValueError(f"nan must be one of {', '.join(CHOICES)}; got {choice!r}")
+    if choice not in NAN_CHOICES:
+        raise ValueError(f"nan must be one of {', '.join(NAN_CHOICES)}; got {choice!r}")
     if not samples.dtype.is_floating_point or transformed() or _all_finite(samples):
         return samples, None
     unknown = ~samples.detach().isfinite()

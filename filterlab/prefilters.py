@@ -47,7 +47,7 @@ class Prefilter:
 
     @property
     def is_identity(self) -> bool:
-        return not self.factors
+        return len(self.factors) == 0
 
     def response(self, omega: Tensor) -> Tensor:
         """P(ω) = Π 1 / q̂(ω); ω in radians per voxel."""

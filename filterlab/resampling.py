@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,6 +22,10 @@ from filterlab.missing_values import resolved
 from filterlab.ops.reference.gather import locate, tap_weights
 from filterlab.volume import Boundary, Geometry, Volume, as_volume, exact_float
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+Progress = Callable[[float], None]
 POINTS_AT_ONCE = 1 << 20
 NEARER = 1e-9  # voxels within which two coordinates are the same: what is halfway between samples, or on the box
 
@@ -32,12 +37,14 @@ def resample(
     spacing: Sequence[float] | float | None = None,
     shape: Sequence[int] | None = None,
     like: Volume | None = None,
+    affine: ArrayLike | None = None,
     boundary: str | Boundary = Boundary.MIRROR,
     prefilter: bool = True,
     dtype: torch.dtype | None = None,
     nan: str = "refuse",
     labels: bool = False,
     fill: float | None = None,
+    progress: Progress = lambda part: None,
 ) -> Volume:
     """The volume reconstructed by a method and sampled on another grid.
 
@@ -48,6 +55,9 @@ def resample(
             the old box of voxels; along an axis of length n·s it has max(1, round(n·s/spacing)) voxels.
         shape: new (D, H, W). The box of voxels is kept exactly, the spacing follows.
         like: a volume whose grid is taken over, wherever it lies (rotated too); outside the old box the boundary rules.
+        affine: a 4×4 matrix that moves the volume first: what was at the world point p is at affine · (p, 1). The new
+            grid is told as if nothing had moved; with none of spacing, shape and like it is the volume's own. A
+            constant; `io.load_affine` reads those of ITK and FSL.
         dtype: floating type of the computation and the result; default promote(volume.dtype, float32), and float64 for
             integers that float32 does not hold. With `nearest` and with `labels`: the volume's.
         labels: every value is a name. Of each the indicator is resampled, and the one that is greatest wins, of equal
@@ -55,10 +65,11 @@ def resample(
             in the memory of one. Not differentiable.
         fill: the value of new voxels whose centres lie outside of the old box of voxels, which ends half a voxel beyond
             the outermost centres; NaN too. Default: none, the boundary rules there.
+        progress: told what part is done, 0 … 1.
 
-    Exactly one of spacing, shape and like must be given. This reconstructs, it does not anti-alias: when the new grid
-    is coarser than the old one, blur first. Cost: one pass of S taps per axis; memory: about two volumes of the larger
-    size.
+    Exactly one of spacing, shape and like must be given, or none with an affine. This reconstructs, it does not
+    anti-alias: when the new grid is coarser than the old one, blur first. Cost: one pass of S taps per axis; memory:
+    about two volumes of the larger size.
 
     Returns:
         a Volume, differentiable in the samples.
@@ -68,19 +79,26 @@ def resample(
             old box, unless the boundary is `wrap` or there is a `fill`.
     """
     volume, boundary = as_volume(volume), Boundary.named(boundary)
+    if affine is not None and spacing is None and shape is None and like is None:
+        like = volume
     target_shape, geometry = _target(volume, spacing, shape, None if like is None else as_volume(like))
-    outside = _outside(volume, target_shape, geometry) if like is not None else None
+    if affine is not None:
+        volume = Volume.with_geometry(volume.samples, volume.geometry.moved(affine))
+    outside = _outside(volume, target_shape, geometry) if like is not None or affine is not None else None
     if outside is not None and fill is None and boundary is not Boundary.WRAP and bool(outside.all()):
         raise ValueError(
-            f"expected grids that overlap; got {volume} and, with no voxel in its box, {like} (or give fill)"
+            f"expected grids that overlap; got {volume} and, with no voxel in its box, one of shape {target_shape}, "
+            f"spacing {[float(f'{s:.6g}') for s in geometry.spacing]}, "
+            f"origin {[float(f'{v:.6g}') for v in geometry.origin]} (or give fill)"
         )
     if labels or as_method(method) is METHODS["nearest"]:
         if dtype not in (None, volume.dtype):
             raise ValueError(f"nearest samples and labels keep their type, {volume.dtype}; got dtype={dtype}")
-        take = _labelled(method, prefilter) if labels else _nearest
+        take = _labelled(method, prefilter, progress) if labels else _nearest
         complete = Volume.with_geometry(_complete(volume.samples, nan), volume.geometry)
         _check_fill(fill, volume.dtype)
         samples = take(complete, target_shape, geometry, boundary)
+        progress(1.0)
         return Volume.with_geometry(_filled(samples, outside, fill), geometry)
     needed = exact_float(volume.samples)
     dtype = dtype or needed
@@ -96,7 +114,8 @@ def resample(
         prefilter=prefilter,
         nan=nan,
     )
-    samples = _sampled(field, volume, target_shape, geometry, working)
+    samples = _sampled(field, volume, target_shape, geometry, working, progress)
+    progress(1.0)
     return Volume.with_geometry(_filled(samples.to(dtype), outside, fill), geometry)
 
 
@@ -149,13 +168,18 @@ def _filled(samples: Tensor, outside: Tensor | None, fill: float | None) -> Tens
 
 
 def _sampled(
-    field: Field, volume: Volume, shape: tuple[int, int, int], geometry: Geometry, dtype: torch.dtype
+    field: Field,
+    volume: Volume,
+    shape: tuple[int, int, int],
+    geometry: Geometry,
+    dtype: torch.dtype,
+    progress: Progress = lambda part: None,
 ) -> Tensor:
     """The field of a volume at the voxel centres of another grid."""
     steps = _aligned(volume.geometry, geometry)
     if isinstance(field, GridField) and field.scheme.terms and steps is not None:
         return _separable(field, shape, *steps, dtype)
-    return _pointwise(field, volume.samples.device, shape, geometry, dtype)
+    return _pointwise(field, volume.samples.device, shape, geometry, dtype, progress)
 
 
 def _aligned(old: Geometry, new: Geometry) -> tuple[np.ndarray, np.ndarray] | None:
@@ -234,7 +258,12 @@ def _along_axis(values: Tensor, dim: int, positions: Tensor, kernel: PiecewisePo
 
 
 def _pointwise(
-    field: Field, device: torch.device, shape: tuple[int, int, int], geometry: Geometry, dtype: torch.dtype
+    field: Field,
+    device: torch.device,
+    shape: tuple[int, int, int],
+    geometry: Geometry,
+    dtype: torch.dtype,
+    progress: Progress,
 ) -> Tensor:
     """The field at every voxel centre of an arbitrary grid, in blocks of about a million points."""
     d, h, w = shape
@@ -244,6 +273,7 @@ def _pointwise(
         i = torch.arange(begin, min(begin + POINTS_AT_ONCE, voxels), device=device)
         points = geometry.to_world(torch.stack((i % w, i // w % h, i // (w * h)), -1).to(torch.float64)).to(dtype)
         parts.append(field(points if field.channels is None else points[None]))
+        progress(min(begin + POINTS_AT_ONCE, voxels) / voxels)
     samples = torch.cat(parts, -1)
     return samples.reshape(*samples.shape[:-1], *shape)
 
@@ -289,7 +319,7 @@ def _chosen(x: Tensor, n: int, boundary: Boundary) -> tuple[Tensor, Tensor]:
 
 
 def _labelled(
-    method: str | Method | PiecewisePolynomial, prefilter: bool
+    method: str | Method | PiecewisePolynomial, prefilter: bool, progress: Progress
 ) -> Callable[[Volume, tuple[int, int, int], Geometry, Boundary], Tensor]:
     """What takes, at every voxel of another grid, the label that a method finds strongest."""
 
@@ -300,6 +330,6 @@ def _labelled(
             )
             return _sampled(field, volume, shape, geometry, torch.float32)
 
-        return strongest(volume.samples, resampled, boundary)
+        return strongest(volume.samples, resampled, boundary, progress)
 
     return labelled

@@ -7,6 +7,9 @@ import io
 import json
 import os
 import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -338,7 +341,9 @@ def test_peers_are_asked_only_for_what_they_have():
 
 # --- every item, tiny ---
 
-PROCESSES = {"startup/triquadratic-first", "startup/tricubic-first", "dvr/memory", "surfaces/memory"}
+PROCESSES = {
+    "startup/triquadratic-first", "startup/tricubic-first", "dvr/memory", "surfaces/memory", "steadiness/renders",
+}  # fmt: skip
 EVERY = [
     (f"{comparison.name}/{item.name}", item) for comparison in COMPARISONS.values() for item in comparison.items(TINY)
 ]
@@ -360,11 +365,29 @@ def test_each_item_has_a_name_of_its_own():
     assert all(item.seconds > 0 for _, item in EVERY)
 
 
+@contextmanager
+def unpinned() -> Iterator[None]:
+    """Every thread of this process goes back to the cores it could use."""
+    if sys.platform != "linux":
+        yield
+        return
+    before = {int(task): os.sched_getaffinity(int(task)) for task in os.listdir("/proc/self/task")}
+    try:
+        yield
+    finally:
+        for task in map(int, os.listdir("/proc/self/task")):
+            os.sched_setaffinity(task, before.get(task, before[os.getpid()]))
+
+
 def test_probes_measure_in_this_process_too():
     found = probe.memory(threads=1, voxels=10, size=3, steps=4)
     assert 2**20 < found["before"] <= found["peak"]
     cast = probe.casting_memory(threads=1, voxels=10, size=3)
     assert 2**20 < cast["before"] <= cast["peak"]
+    with unpinned():
+        steady = probe.steadiness(threads=1, voxels=10, size=3, renders=3)
+    assert 0 < steady["median"] <= steady["slowest"]
+    assert min(steady.values()) > 0
     calls = probe.first_call(["trilinear", "triquadratic"])
     assert set(calls) == {"trilinear", "triquadratic", "again"}
     assert min(calls.values()) > 0

@@ -77,7 +77,7 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_line_that_makes_no_sense(capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.nrrd"
-    fails(capsys, ["rendr"], 2, "render, mesh, scene, sdf, resample,")
+    fails(capsys, ["rendr"], 2, "render, mesh, scene, sdf, resample, recommend")
     fails(capsys, ["resample", volume_file], 2, "--output")
     fails(capsys, ["resample", volume_file, "-o", out], 2, "one of --spacing, --shape and --like; got none")
     fails(capsys, ["resample", volume_file, "-o", out, "--spacing", "1", "1"], 2, "--spacing")
@@ -95,9 +95,31 @@ def test_the_installed_command_in_its_own_process(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_help_does_not_wait_for_torch() -> None:
-    code = "import sys; from filterlab.cli import main; main(['render', '--help']); sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+def test_what_needs_no_torch_does_not_wait_for_it(volume_file: Path) -> None:
+    asked = [
+        ["--help"],
+        ["render", "--help"],
+        ["rendr"],
+        [
+            "resample",
+            str(volume_file),
+            "-o",
+            str(volume_file.with_name("o.nrrd")),
+            *["--shape", "2", "2", "2", "--method", "no"],
+        ],
+        ["recommend", str(volume_file), "--max-error", "1%", "--task", "no"],
+        ["info", str(volume_file)],
+        ["info", str(volume_file.with_name("none.nrrd"))],
+    ]
+    code = f"""
+import sys
+from filterlab.cli import main
+codes = [main(asked) for asked in {asked!r}]
+assert codes == [0, 0, 2, 1, 1, 0, 1], codes
+assert "torch" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_split_overrides() -> None:
@@ -291,7 +313,8 @@ def test_what_is_odd_about_a_file_is_told_in_a_line(
     capsys: pytest.CaptureFixture[str], series_file: Path, tmp_path: Path
 ) -> None:
     series_file.write_bytes(series_file.read_bytes() + b"more")
-    for command in (["info", str(series_file)], ["resample", str(series_file), "-o", "out.npy", "--shape", *"222"]):
+    resampled = ["resample", str(series_file), "-o", "out.npy", "--quiet", "--shape", *"222"]
+    for command in (["info", str(series_file)], resampled):
         command = [str(tmp_path / a) if a == "out.npy" else a for a in command]
         assert main([*command, "--frame", "0", "--channel", "0"]) == 0
         told = f"filterlab: {series_file}: passed over what comes behind its 1440 bytes of samples\n"
@@ -380,7 +403,8 @@ def test_resample_tells_what_nifti_1_rounds(
     assert np.array_equal(load_volume(out).affine, exact.astype(np.float32))
     assert main([*line, "0.7", "0.7", "0.7", "--nifti2"]) == 0
     assert np.array_equal(load_volume(out).affine, exact)
-    assert main([*line, "0.5", "0.5", "0.5"]) == 0  # exact in float32
+    capsys.readouterr()
+    assert main([*line, "0.5", "0.5", "0.5", "-q"]) == 0  # exact in float32
     assert capsys.readouterr().err == ""
     assert main(["resample", str(volume_file), "-o", str(tmp_path / "a.nrrd"), "--shape", *"345", "--nifti2"]) == 1
     assert "for NIfTI-2; got NRRD" in capsys.readouterr().err
@@ -421,7 +445,7 @@ def test_labels_stay_labels(capsys: pytest.CaptureFixture[str], label_file: Path
     assert main(line) == 0
     assert "labels.nrrd: its values look like labels" in capsys.readouterr().err
     assert len(load_volume(out).samples.unique()) > 100
-    assert main([*line, *how]) == 0
+    assert main([*line, *how, "--quiet"]) == 0
     assert capsys.readouterr().err == ""
     assert load_volume(out).samples.unique().tolist() == [0, 2, 4]
     assert describe(out).stored == "uint16"
@@ -519,7 +543,7 @@ def test_the_memory_limit_counts_the_bytes_of_the_type(
     save_volume(torch.ones(2, 2, 2, dtype=stored), tmp_path / "in.nrrd")
     line = ["resample", tmp_path / "in.nrrd", "-o", tmp_path / "out.nrrd", "--shape", 16, 16, 16, "--dtype", dtype]
     exact = 16**3 * itemsize / 2**30
-    assert main([str(a) for a in [*line, "--max-gigabytes", exact]]) == 0
+    assert main([str(a) for a in [*line, "--quiet", "--max-gigabytes", exact]]) == 0
     assert capsys.readouterr().err == ""
     fails(capsys, [*line, "--max-gigabytes", exact * 0.999], 1, "--max-gigabytes", f"voxels of {itemsize} bytes")
 
@@ -553,7 +577,8 @@ def test_render(scene_file: Path, tmp_path: Path, capfd: pytest.CaptureFixture[s
     assert image.shape == (16, 24, 3)
     assert image.max() > 0.2
     assert image.std() > 0.01
-    assert main(["render", str(scene_file), "-o", str(out), "--method", "notch", "--size", "8", "6"]) == 0
+    capfd.readouterr()
+    assert main(["render", str(scene_file), "-q", "-o", str(out), "--method", "notch", "--size", "8", "6"]) == 0
     assert load_image(out).shape == (6, 8, 3)
     assert capfd.readouterr() == ("", "")  # no bar where nobody looks
     assert sorted(os.listdir(tmp_path)) == ["a.png", "scene.yaml"]

@@ -17,6 +17,7 @@ from filterlab.roots import all_roots, first_root
 from filterlab.surfaces import LevelSet
 from filterlab.volume import Boundary, Volume
 from tests.test_methods import TENSOR_PRODUCTS
+from tests.tetrahedral_oracle import SPLINES
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU that torch can use")
 
@@ -162,7 +163,7 @@ def _hits(device: str, method: str, dtype: torch.dtype) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize("method", [*TENSOR_PRODUCTS, *SPLINES])
 def test_hits_and_their_derivatives(method: str, dtype: torch.dtype) -> None:
     """A ray or two of float32 may graze the level, and pass on one device."""
     expected, found = _hits("cpu", method, dtype), _hits("cuda", method, dtype)

@@ -163,6 +163,28 @@ def test_bc_kernels_reproduce_quadratics_only_where_b_plus_2c_is_one():
         assert off_it.approximation_order == laws.strang_fix_order(evaluate(off_it), 2) == 1
 
 
+@pytest.mark.parametrize("b", [Fraction(b) for b in ("-1", "0", "1/3", "1", "3/2", "2")])
+@pytest.mark.parametrize("off", [Fraction(0), Fraction(1, 7)])
+def test_the_order_without_a_prefilter_is_how_far_samples_of_polynomials_give_them_back(b, off):
+    """Exactly: Σ_k k^j φ(x−k) = x^j for all j < L, and not for L. BC(−1, 1) has the moments 1, 0, −1/3: L is 2."""
+    kernel = bc(b, (1 - b) / 2 + off)
+
+    def gives_back(j: int) -> bool:
+        at = (Fraction(1, 7), Fraction(2, 5), Fraction(-3, 4))
+        return all(sum(k**j * kernel.exact(x - k) for k in range(-4, 5)) == x**j for x in at)
+
+    order = next(j for j in range(9) if not gives_back(j))
+    assert kernel.direct_order == order
+    assert bc(Fraction(-1), Fraction(1)).direct_order == 2
+
+
+def test_a_kernel_that_does_not_give_back_constants_has_no_order_without_a_prefilter():
+    """A box of height 2 sums to a constant that is 2, a ramp of area 1 to none."""
+    for pieces, order in ((((2,),), 1), (((0, 2),), 0)):
+        kernel = Kernel("no", tuple(tuple(map(Fraction, piece)) for piece in pieces))
+        assert (kernel.approximation_order, kernel.direct_order) == (order, 0)
+
+
 @pytest.mark.parametrize("derivative", range(3))
 def test_tensor_kernels_are_differentiable_twice(derivative):
     x = torch.tensor([-1.7, -0.4, 0.2, 0.9, 1.3], dtype=torch.float64, requires_grad=True)

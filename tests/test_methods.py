@@ -411,18 +411,14 @@ def test_every_storage_and_point_type(method, storage, point_type):
 
 
 @every_method
-@pytest.mark.parametrize("storage", ["int8", "int32", "int64", "uint16", "uint32", "uint64"])
-def test_every_real_type_that_a_volume_accepts_can_be_reconstructed(method, storage):
-    """Accepted means usable: what cannot be read is refused by Volume, not by an inner function of torch."""
+@pytest.mark.parametrize("storage", [torch.int8, torch.int32, torch.int64])
+@pytest.mark.parametrize("boundary", ["mirror", "zeros"])
+def test_integers_of_any_width_are_the_numbers_that_they_are(method, storage, boundary):
+    """Those that torch has, beside what `test_every_storage_and_point_type` takes."""
     f = (torch.as_tensor(samples_of((4, 3, 5))) * 50 + 60).round()
-    try:
-        volume = Volume(f.to(getattr(torch, storage)))
-    except TypeError:
-        return
     points = torch.tensor([[1.25, 0.75, 2.5], [3.6, 1.1, -0.5]])
-    for boundary in ("mirror", "zeros"):
-        expected = reconstruct(f.float(), method, boundary=boundary)(points)
-        laws.assert_close(reconstruct(volume, method, boundary=boundary)(points), expected, 1e-6, 120)
+    expected = reconstruct(f.float(), method, boundary=boundary)(points)
+    laws.assert_close(reconstruct(f.to(storage), method, boundary=boundary)(points), expected, 1e-6, 120)
 
 
 @every_method

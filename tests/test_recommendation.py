@@ -16,10 +16,11 @@ from filterlab import costs
 from filterlab.cli import main
 from filterlab.cli.options import MEMORY, TIME, quantity
 from filterlab.cli.outcome import UsageError
+from filterlab.fields.base import Field
 from filterlab.io.config import loads_config
 from filterlab.recommendation import ErrorEstimate, Recommendation, recommend, report, ways
 from filterlab.recommendation.choice import IMAGE, Question, _marched, choose
-from filterlab.recommendation.errors import Distance, Yardstick
+from filterlab.recommendation.errors import Distance, MethodErrors, Yardstick
 from filterlab.recommendation.survey import inner_box
 from filterlab.recommendation.ways import WayCost
 from filterlab.scenes.model import Scene
@@ -218,6 +219,19 @@ def test_what_only_the_whole_volume_tells_is_found_before_it_is_picked() -> None
     assert found.pick.storage is None
 
 
+def test_the_best_is_the_one_with_the_least_upper_end_whatever_it_costs() -> None:
+    """Both may be exact, as far as the samples tell; the cheaper one is three times as far from the reference."""
+    volume = fl.Volume(torch.rand(8, 8, 8))
+    doubts = {"value": 0.05, "gradient": 0.05, "bend": 0.0}
+    yardstick = Yardstick(fl.Boundary.MIRROR, (0.0, 1.0), (), (), doubts, 0.0, 0.0, 0.0)
+    cheap, best = ("trilinear", "fused", None), ("tricubic", "fused", None)
+    errors = {way: MethodErrors(Distance(rms), Distance(rms)) for way, rms in ((cheap, 0.03), (best, 0.01))}
+    question = Question("resample", 1e-9, math.inf, math.inf, "mirror", "refuse")
+    found = choose(question, volume, yardstick, errors, {cheap: WayCost(1.0, 9.0, 8), best: WayCost(2.0, 9.0, 8)})
+    assert [c.error.low for c in found.candidates] == [0, 0]
+    assert found.best.method == "tricubic"
+
+
 def test_no_integer_is_nan(samples) -> None:
     hole = samples[:20, :20, :20].clone()
     hole[3, 4, 5] = math.nan
@@ -287,18 +301,25 @@ def test_the_step_is_the_longest_within_the_budget(budget, expected) -> None:
     assert error == estimate(step)
 
 
-def fixed_costs(monkeypatch, nanoseconds: float = 50.0) -> None:
-    """Costs without a clock: so long for every sample, and a nanosecond for every voxel of a build."""
+def fixed_costs(monkeypatch, nanoseconds: float = 50.0) -> dict[str, tuple[Field, int]]:
+    """Costs without a clock: so long for every sample, and a nanosecond for every voxel of a build.
+
+    Returns what was measured: way -> the field, and the order of its jets.
+    """
+    measured = {}
 
     def measure(candidates, points, *, order, seconds, tick):
         found = {}
         for name, build in candidates.items():
-            voxels = math.prod(build().coefficients.size)
-            quartiles = [costs.Quartiles(x, x, x) for x in (1e-9 * voxels, nanoseconds)]
+            field = build()
+            measured[name] = field, order
+            voxels = math.prod(field.coefficients.size)
+            quartiles = [costs.Quartiles(x / 2, x, 3 * x) for x in (1e-9 * voxels, nanoseconds)]
             found[name] = costs.Cost(*quartiles, 0, ())
         return found
 
     monkeypatch.setattr(ways.costs, "measure", measure)
+    return measured
 
 
 def test_seconds_and_bytes_are_those_of_the_whole_volume(monkeypatch) -> None:
@@ -314,15 +335,46 @@ def test_seconds_and_bytes_are_those_of_the_whole_volume(monkeypatch) -> None:
         assert found.seconds == pytest.approx(1e-9 * voxels + 50e-9 * voxels)
 
 
-def test_a_picture_takes_as_many_samples_as_its_pixels_see_of_the_volume(monkeypatch) -> None:
-    """A cube of n voxels fills n³ / (3 n² · n) of a cube that is as wide as its diagonal."""
+@pytest.mark.parametrize("boundary", list(fl.Boundary))
+@pytest.mark.parametrize("shape", [(6, 1, 170), (1, 2, 2, 165, 5)])
+def test_bytes_are_those_of_the_field_that_is_built(boundary, shape, monkeypatch) -> None:
+    """Of every method and storage, though only the middle 160 voxels of an axis are looked at."""
+    measured, volume = fixed_costs(monkeypatch), fl.Volume(torch.rand(shape))
+    samples = volume.samples.reshape(-1, *shape[-3:])[0]
+    asked = [way for method in fl.METHODS.values() for way in ways.ways_of(method, samples.dtype, True)]
+    found = ways.costs_of(samples, volume, asked, boundary, 1, 0.0)
+    assert set(fl.METHODS) == {method for method, _, _ in found}
+    for (method, scheme, storage), cost in found.items():
+        field = fl.reconstruct(volume, method, boundary=boundary, scheme=scheme, storage=storage)
+        assert cost.memory == field.coefficients.values.nbytes, (method, storage)
+        assert cost.build == pytest.approx(1e-9 * volume.samples.numel())
+    part, _ = measured["nearest/fused/None"]
+    long = max(range(3), key=lambda dim: shape[-3:][dim])
+    low = (shape[-3:][long] - 160) // 2
+    middle = fl.reconstruct(samples.narrow(long, low, 160).contiguous(), "nearest", boundary=boundary)
+    assert torch.equal(part.coefficients.values, middle.coefficients.values)
+
+
+@pytest.mark.parametrize(("task", "order"), [("resample", 0), ("isosurface", 1), ("dvr", 1)])
+def test_what_is_timed_is_what_the_task_asks_for(task, order, monkeypatch) -> None:
+    measured = fixed_costs(monkeypatch)
+    recommend(torch.rand(8, 8, 8), 1e-9, task=task, methods=["trilinear"])
+    assert [asked for _, asked in measured.values()] == [order]
+
+
+@pytest.mark.parametrize("volumes", [1, 6])
+def test_a_picture_takes_as_many_samples_as_its_pixels_see_of_the_volume(volumes, monkeypatch) -> None:
+    """A box of 12 × 16 × 20 voxels fills their product of a cube that is as wide as its diagonal: of every volume."""
     fixed_costs(monkeypatch)
-    answer = recommend(waves(0.3, 16).sample(16).samples, 1e-9, task="dvr", methods=["trilinear", "tricubic"])
+    samples = waves(0.3, 20).sample(20).samples[:12, :16].expand(volumes, 1, 12, 16, 20)
+    volume = samples if volumes > 1 else samples[0, 0]
+    answer = recommend(volume, 1e-9, task="dvr", methods=["trilinear", "tricubic"])
+    voxels, diagonal = 12 * 16 * 20, math.sqrt(12**2 + 16**2 + 20**2)
     assert len({c.step for c in answer.candidates}) > 1
     for c in answer.candidates:
         assert c.step is not None
-        samples = IMAGE**2 * 16 / 3 / c.step
-        assert c.seconds == pytest.approx(1e-9 * 16**3 + 50e-9 * samples)
+        samples = volumes * (IMAGE / diagonal) ** 2 * voxels / c.step
+        assert c.seconds == pytest.approx(1e-9 * volumes * voxels + 50e-9 * samples)
 
 
 def test_limits_of_time_are_seconds(monkeypatch) -> None:

@@ -158,6 +158,32 @@ def test_float32_positions_do_not_drift_on_long_axes():
     laws.assert_close(out.samples, exact.samples, 5e-6, 2.0)
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-6, 5e-4])
+def test_grids_that_are_aligned_or_nearly_so_are_sampled_where_they_lie(angle):
+    """5e-4 are more than a voxel at the end of 2800, and seen in which sample is nearest; 1e-9 are 3e-6 of one."""
+    source, affine = Volume(volume(1, 3, 2800)), np.eye(4)
+    affine[:2, :2] = [[0.7 * math.cos(angle), -math.sin(angle)], [0.7 * math.sin(angle), math.cos(angle)]]
+    like = Volume(torch.zeros(1, 1, 4000), affine=affine)
+    at = centres(like)
+    laws.assert_close(resample(source, "tricubic", like=like).samples, reconstruct(source, "tricubic")(at), 2e-12)
+    x, y, _ = (at + 0.5 + 1e-9).floor().long().clamp_max(2799).unbind(-1)
+    assert torch.equal(resample(source, "nearest", boundary="border", like=like).samples, source.samples[0, y, x])
+    assert int(y.max()) == (1 if angle == 5e-4 else 0)
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["aligned", "axes exchanged"])
+@pytest.mark.parametrize(("tenths", "count"), [(21, 4001), (12, 3411)])  # float32 has 2.1 too small and 1.2 too large
+def test_voxel_numbers_keep_their_digits_on_long_axes(tenths, count, turned):
+    """Every tenth new voxel is halfway between two samples, where the later is taken; the last is on the box."""
+    size = tenths * (count - 1) // 10
+    source = Volume(torch.arange(size, dtype=torch.int32)[None, None])
+    affine = np.diag([tenths / 10, 1, 1, 1])[:, [1, 0, 2, 3] if turned else [0, 1, 2, 3]]
+    affine[0, 3] = -0.5
+    like = Volume(torch.zeros(1, count, 1) if turned else torch.zeros(1, 1, count), affine=affine)
+    found = resample(source, "nearest", like=like, boundary="border", fill=-1).samples.flatten()
+    assert found.tolist() == [min(tenths * i // 10, size - 1) for i in range(count)]
+
+
 @pytest.mark.parametrize(
     ("target", "match"),
     [

@@ -117,6 +117,33 @@ def test_an_exact_signal_is_its_own_field_and_normalized_axes_span_the_samples(s
     assert transfer.positions.tolist() == pytest.approx([middle - half, middle, middle + half], rel=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("shown", "raw"),
+    [
+        (
+            "transfer: {axis: normalized, peaks: [{center: 1, width: 1, height: 0.9, color: [1, 1, 1]}]}",
+            "transfer: {peaks: [{center: 5, width: 4, height: 0.9, color: [1, 1, 1]}]}",
+        ),
+        ("surface: {axis: normalized, level: 0.4}", "surface: 2.6"),
+    ],
+    ids=["medium", "surface"],
+)
+def test_missing_voxels_are_transparent_and_not_in_the_range(shown, raw, scene_file, tmp_path):
+    samples = torch.rand(6, 7, 8, generator=torch.Generator().manual_seed(1)) * 4 + 1
+    samples[2, 3, 4], samples[4, 5, 6] = 1, 5
+    samples[:, :3, :4] = math.nan
+    samples[5, 6, 7] = math.inf
+    save_volume(samples, tmp_path / "torn.npy")
+    head = "volume: torn.npy\nmethod: {name: trilinear, nan: propagate}\nsize: [20, 16]\n"
+    image = build(load_scene(scene_file(head + shown))).render()
+    assert torch.equal(image, build(load_scene(scene_file(head + raw))).render())
+    assert image.isfinite().all()
+    filled = build(load_scene(scene_file(head.replace("propagate", "fill") + shown))).render()
+    assert ((filled - image)[..., 3] > 0.1).sum() > 10
+    assert (image[..., 3] > 0.1).sum() > 10
+    save_image(render_scene(load_scene(scene_file(head + shown))), tmp_path / "torn.png")
+
+
 def test_volume_files_are_found_beside_the_scene_and_by_variables(scene_file, tmp_path, monkeypatch):
     saved_volume(tmp_path)
     elsewhere = tmp_path / "elsewhere"

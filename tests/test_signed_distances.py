@@ -219,7 +219,7 @@ def written(path: Path, faces: slice = slice(None)) -> str:
     ],
 )
 def test_command(options, size, tmp_path, capsys):
-    assert main(["sdf", written(tmp_path / "box.ply"), "-o", str(tmp_path / "box.nrrd"), *options]) == 0
+    assert main(["sdf", written(tmp_path / "box.ply"), "-q", "-o", str(tmp_path / "box.nrrd"), *options]) == 0
     volume = load_volume(tmp_path / "box.nrrd")
     assert (volume.size, volume.dtype) == (size, torch.float32)
     assert_close(volume.samples, distance_to_box(centres(volume)), 1e-6)

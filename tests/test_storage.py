@@ -64,6 +64,18 @@ def test_what_is_zero_stays_zero(storage):
 
 
 @pytest.mark.parametrize("storage", INTEGER)
+@pytest.mark.parametrize("offset", [0.0, 1000.0, -8.0])
+def test_integers_use_every_level(storage, offset):
+    """As many evenly spaced coefficients as there are levels have one each, and come back as they were."""
+    values = offset + 0.25 * torch.arange(STEPS[storage] + 1, dtype=torch.float64).reshape(1, 1, -1)
+    stored, quantization = stored_as(values, STORAGE[storage])
+    info = torch.iinfo(STORAGE[storage])
+    assert stored.flatten().tolist() == list(range(info.min, info.max + 1))
+    assert quantization is not None
+    assert torch.equal(quantization.decoded(stored, torch.float64), values)
+
+
+@pytest.mark.parametrize("storage", INTEGER)
 def test_a_constant_volume_is_stored_exactly(storage):
     field = fl.reconstruct(torch.full((4, 5, 6), 7.25), "tricubic", storage=storage)
     torch.testing.assert_close(field(points().float()), torch.full((200,), 7.25), rtol=2e-6, atol=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 
 import numpy as np
@@ -203,13 +204,52 @@ def test_a_singular_affine_is_refused(matrix):
         Volume(torch.zeros(2, 2, 2), affine=affine)
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("scale", [1e-50, 1.0, 1e50])
+def test_columns_that_nearly_coincide_span_nothing(side, scale):
+    """1e-12 apart they do to no purpose, whatever the sign of the determinant and the unit; 1e-6 apart they do."""
+    for apart, regular in ((1e-6, True), (1e-12, False)):
+        affine = np.eye(4)
+        affine[:3, :3] = scale * np.array([[1, 1, 0], [0, side * apart, 0], [0, 0, 1]])
+        if regular:
+            assert Volume(torch.zeros(2, 2, 2), affine=affine).affine.tolist() == affine.tolist()
+        else:
+            with pytest.raises(ValueError, match="finite and invertible"):
+                Volume(torch.zeros(2, 2, 2), affine=affine)
+
+
 def test_a_tiny_spacing_is_no_singular_affine():
     assert Volume(torch.zeros(2, 2, 2), spacing=1e-101).spacing == pytest.approx((1e-101,) * 3)
 
 
-def test_unsigned_types_without_indexing_are_refused():
-    with pytest.raises(TypeError, match=r"convert: samples\.to\(torch\.int32\)"):
-        Volume(torch.zeros(2, 2, 2, dtype=torch.uint16))
+ACCEPTED = ["uint8", "int8", "int16", "int32", "int64", "float16", "bfloat16", "float32", "float64"]
+REFUSED = {
+    "real numbers": ["bool", "complex32", "complex64", "complex128"],
+    r"convert: samples\.to\(torch\.int32\)": ["uint16", "uint32", "uint64"],
+    r"convert: samples\.to\(torch\.float16\)": ["float8_e4m3fn", "float8_e4m3fnuz", "float8_e5m2", "float8_e5m2fnuz"],
+}
+
+
+def types_of_torch() -> set[torch.dtype]:
+    """All that a tensor can have, those that are new to these tests included."""
+    found = set()
+    for dtype in {v for v in vars(torch).values() if isinstance(v, torch.dtype)}:
+        with contextlib.suppress(NotImplementedError, RuntimeError):
+            torch.ones(1).to(dtype)
+            found.add(dtype)
+    return found
+
+
+@pytest.mark.filterwarnings("ignore:ComplexHalf support is experimental")
+def test_every_type_is_accepted_or_refused_at_once():
+    """What is accepted is used in test_methods; what is not says what to convert it to."""
+    refused = {getattr(torch, name): match for match, names in REFUSED.items() for name in names}
+    for dtype in types_of_torch() - {getattr(torch, name) for name in ACCEPTED}:
+        match = refused.get(dtype, "convert: ")
+        with pytest.raises(TypeError, match=match):
+            Volume(torch.ones(2, 2, 2).to(dtype))
+    for name in ACCEPTED:
+        assert Volume(torch.ones(2, 2, 2).to(getattr(torch, name))).dtype == getattr(torch, name)
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])

@@ -1,6 +1,7 @@
 """Rays at level sets of splines on tetrahedra, by classes, and what is found along them against the oracle.
 
-`python -m tests.tetrahedral_rays 1200 1000 7` judges for 1200 seconds, 1000 rays at a time, from seed 7 on.
+`python -m tests.tetrahedral_rays 1200 1000 7 cuda` judges for 1200 seconds, 1000 rays at a time, from seed 7 on, on a
+GPU: rays, seed and device may be left out.
 """
 
 from __future__ import annotations
@@ -89,6 +90,14 @@ def axis_parallel(rng: np.random.Generator, _: Case, rays: int) -> Rays:
     sign = rng.choice([-1.0, 1.0], rays)
     origins[np.arange(rays), axis] -= sign * 12
     return origins, np.eye(3)[axis] * sign[:, None]
+
+
+def in_last_faces(rng: np.random.Generator, case: Case, rays: int) -> Rays:
+    """Across one axis, at the upper end of the domain."""
+    origins, directions = random(rng, case, rays)
+    ray, axis = np.arange(rays), np.arange(rays) % 3
+    origins[ray, axis], directions[ray, axis] = (SIZE - 0.5)[axis], 0
+    return origins, directions
 
 
 def inside_out(rng: np.random.Generator, _: Case, rays: int) -> Rays:
@@ -180,19 +189,20 @@ CLASSES: dict[str, tuple[Of, Make]] = {
     "from far away": (noise, from_far),
     "grazing": (noise, grazing),
     "thin shells": (thin_shell, random),
+    "in last faces": (noise, in_last_faces),
 }
 
 # ---- verdicts
 
 
-def judged(case: Case, rays: Rays, far: bool = False, **chosen: object) -> Counter[str]:
+def judged(case: Case, rays: Rays, far: bool = False, device: str = "cpu", **chosen: object) -> Counter[str]:
     """First hits and all hits of filterlab on rays: what is missed, invented, later than it is, out of place."""
     origins, directions = rays
     truth = crossings(case.polynomials, origins, directions, case.level, 3e-8 if far else 1e-11)
     options = {"boundary": case.boundary, "prefilter": case.prefilter, **chosen}
-    surface = LevelSet(fl.reconstruct(torch.from_numpy(case.samples), case.name, **options), case.level)  # type: ignore
-    o, d = map(torch.from_numpy, rays)
-    first, every = surface.hit(o, d).t.numpy(), surface.hits(o, d, SHEETS).t.numpy()
+    volume, o, d = (torch.from_numpy(x).to(device) for x in (case.samples, *rays))
+    surface = LevelSet(fl.reconstruct(volume, case.name, **options), case.level)  # type: ignore
+    first, every = surface.hit(o, d).t.cpu().numpy(), surface.hits(o, d, SHEETS).t.cpu().numpy()
     tolerance = (1e-6 if far else 1e-8) / np.linalg.norm(directions, axis=1)
     found = Counter(of_first(truth, first, tolerance))
     found.update({f"sheets {key}": n for key, n in ray_oracle.judged(truth, every, tolerance).items()})
@@ -229,7 +239,7 @@ def one(name: str, boundary: str, prefilter: bool, kind: str, rays: int, seed: i
 def campaign(seconds: float, rays: int = 1000, first: int = 0, **chosen: object) -> dict[tuple[str, str], Counter[str]]:
     """All splines, boundaries and classes, with and without prefilter, in turn, seed after seed until time is up.
 
-    What has a fault is printed as it is found: the arguments of `one`. Options go to `reconstruct`.
+    What has a fault is printed as it is found: the arguments of `one`. A device is chosen, options go to `reconstruct`.
     """
     found: dict[tuple[str, str], Counter[str]] = {}
     begin = time.perf_counter()
@@ -245,5 +255,6 @@ def campaign(seconds: float, rays: int = 1000, first: int = 0, **chosen: object)
 
 
 if __name__ == "__main__":
-    for (spline, kind), verdict in campaign(*map(float, sys.argv[1:2]), *map(int, sys.argv[2:])).items():
+    where = {"device": sys.argv[4]} if len(sys.argv) > 4 else {}
+    for (spline, kind), verdict in campaign(*map(float, sys.argv[1:2]), *map(int, sys.argv[2:4]), **where).items():
         print(f"{spline:13}{kind:23}", *(f"{key} {verdict[key]}" for key in ("rays", "undecided", "hits", *FAULTS)))

@@ -1,10 +1,12 @@
 """Processes that are killed at every moment of writing, and what they leave behind.
 
-A moment is a line of Python in one of the modules that write. A child process, forked from one that has everything
-imported, ends itself with SIGKILL when it has come to line k: nothing of Python or of the C library runs any more, as
-when the machine's memory is out. What it left is then looked at, and the work is done again, on top of it.
+A moment is a line of Python in one of the modules that write. What lies in the folder there is what a kill would leave:
+it is read at every moment, and every state of it is looked at, and the work is done again, on top of it. As that only
+says what a kill should leave, some kills are real. A child process, forked from one that has everything imported, ends
+itself with SIGKILL when it has come to line k: nothing of Python or of the C library runs any more, as when the
+machine's memory is out.
 
-    python -m experiments.extremes.killing STRIDE      every STRIDE-th moment; prints what came of it as JSON
+    python -m experiments.extremes.killing STRIDE      kills at every STRIDE-th moment; prints what came of it as JSON
 """
 
 from __future__ import annotations
@@ -42,14 +44,20 @@ class Killed:
     Attributes:
         work: what it is.
         moments: lines that it runs through.
+        states: of its folder, different ones, at any of them.
         kills: how many times it was killed.
         findings: what was left that must not be, each with its moment.
     """
 
     work: str
     moments: int
+    states: int = 0
     kills: int = 0
     findings: list[str] = field(default_factory=list)
+
+
+State = tuple[tuple[str, bytes | None], ...]
+"""Of a folder: names below it, and what the files hold; None: a folder."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +80,14 @@ class Work:
 
 
 def killed_everywhere(work: Work, stride: int = 1) -> Killed:
-    """Kills the work at every `stride`-th of its moments."""
-    with TemporaryDirectory() as folder:
-        work.begin(Path(folder))
-        moments = _moments(lambda: work.do(Path(folder)))
-    result = Killed(work.name, moments)
+    """Looks at what every moment of the work would leave, and kills it at every `stride`-th."""
+    moments, states = _watched(work)
+    result = Killed(work.name, moments, len(states))
+    for state, moment in states.items():
+        with TemporaryDirectory() as folder:
+            _lay_out(state, Path(folder))
+            found = _found_after(work, Path(folder))
+        result.findings += [] if found is None else [f"as of line {moment} of {moments}: {found}"]
     for moment in range(1, moments + 1, stride):
         with TemporaryDirectory() as folder:
             found = _killed_at(work, Path(folder), moment)
@@ -85,11 +96,46 @@ def killed_everywhere(work: Work, stride: int = 1) -> Killed:
     return result
 
 
+def _watched(work: Work) -> tuple[int, dict[State, int]]:
+    """How many moments the work has, and every state of its folder, with the first moment that finds it."""
+    count, states = 0, {}
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        work.begin(folder)
+
+        def at_line() -> None:
+            nonlocal count
+            count += 1
+            states.setdefault(_state(folder), count)
+
+        _traced(at_line, lambda: work.do(folder))
+    return count, states
+
+
+def _state(folder: Path) -> State:
+    """The folders and files below a folder, with their contents."""
+    below = sorted(folder.rglob("*"))
+    return tuple((str(path.relative_to(folder)), None if path.is_dir() else path.read_bytes()) for path in below)
+
+
+def _lay_out(state: State, folder: Path) -> None:
+    for name, content in state:
+        if content is None:
+            (folder / name).mkdir()
+        else:
+            (folder / name).write_bytes(content)
+
+
 def _killed_at(work: Work, folder: Path, moment: int) -> str | None:
     work.begin(folder)
     status = _in_a_child(lambda: _until(moment, lambda: work.do(folder)))
     if not (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL):
         return f"the process was not killed (status {status})"
+    return _found_after(work, folder)
+
+
+def _found_after(work: Work, folder: Path) -> str | None:
+    """What is wrong with what a kill left, or with what the work, done again, makes of it."""
     found = checked(work.damaged, folder)
     if found is None and _in_a_child(lambda: work.do(folder)) != 0:
         found = "the work could not be done again"
@@ -130,17 +176,6 @@ def _traced(at_line: Callable[[], None], action: Callable[[], object]) -> None:
         action()
     finally:
         sys.settrace(None)
-
-
-def _moments(action: Callable[[], object]) -> int:
-    count = 0
-
-    def at_line() -> None:
-        nonlocal count
-        count += 1
-
-    _traced(at_line, action)
-    return count
 
 
 def _until(moment: int, action: Callable[[], object]) -> None:

@@ -34,7 +34,7 @@ def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section
 
 def _images(config: Config, truth: Record, methods: Sequence[Record], folder: Path) -> Gallery:
     pictures = [picture(folder, truth["image"], f"{config.signal.name} itself", "ground truth")]
-    pictures += [picture(folder, r["image"], label(r), _quality(r)) for r in methods]
+    pictures += [picture(folder, r["image"], label(r), quality(r)) for r in methods]
     caption = (
         f"{config.signal.label}, sampled at {config.resolution}³ cell centres, boundary {config.boundary}; "
         f"{_view(config)}. PSNR and SSIM against the image of the signal itself, both as displayed (sRGB)."
@@ -47,13 +47,14 @@ def _view(config: Config) -> str:
     return f"{width} × {height} pixels, step {config.view.step:g} voxels, {config.dtype}"
 
 
-def _quality(record: Record) -> str:
+def quality(record: Record) -> str:
+    """How near an image is to the one it is compared with."""
     psnr = MISSING if record["psnr"] is None else f"{fixed(record['psnr'], 1)} dB"
     return f"{psnr} · SSIM {fixed(record['ssim'], 3)}"
 
 
 def _differences(config: Config, methods: Sequence[Record], folder: Path) -> Gallery:
-    pictures = [picture(folder, r["difference"], label(r), _quality(r)) for r in methods]
+    pictures = [picture(folder, r["difference"], label(r), quality(r)) for r in methods]
     caption = (
         f"Absolute differences to the image of the signal itself, as displayed, amplified {config.amplify:g} times; "
         "black is no difference, and what exceeds white is cut off."

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from experiments.report.dvr_signal import quality
 from experiments.report.page import Block, Column, Gallery, Section, Table, picture
 from experiments.report.style import MISSING, fixed, label
 from experiments.runs import Record
@@ -26,6 +27,7 @@ def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section
         found = [records[f"{r.key}/{name}"] for r in config.methods if f"{r.key}/{name}" in records]
         if found:
             blocks.append(_gallery(config, name, found, folder))
+            blocks += _differences(config, found, folder)
     if records:
         blocks.append(_times(config, records))
     return Section(f"Rendering a scan: {_name(config)}", LEAD, blocks)
@@ -51,6 +53,19 @@ def _gallery(config: Config, name: str, records: Sequence[Record], folder: Path)
     return Gallery(pictures, caption, columns=3 if len(pictures) > 4 else 2)
 
 
+def _differences(config: Config, records: Sequence[Record], folder: Path) -> list[Block]:
+    """Where the images are not that of the reference."""
+    others = [r for r in records if "difference" in r]
+    if not others:
+        return []
+    pictures = [picture(folder, r["difference"], label(r), quality(r)) for r in others]
+    caption = (
+        f"Absolute differences to the image of {config.reference}, as displayed, amplified {config.amplify:g} times; "
+        "black is no difference. Which of two is nearer to the object, they do not tell."
+    )
+    return [Gallery(pictures, caption, columns=3 if len(pictures) > 4 else 2)]
+
+
 def _times(config: Config, records: Mapping[str, Record]) -> Table:
     names = list(config.windows)
     titles = ["whole view", *(zoom.title for zoom in config.zooms)]
@@ -63,5 +78,8 @@ def _times(config: Config, records: Mapping[str, Record]) -> Table:
         first = next(iter(found.values()))
         times = [fixed(found[n]["render_seconds"], 1) if n in found else MISSING for n in names]
         rows.append([label(first), fixed(first["build_seconds"]), *times])
-    caption = f"Wall-clock seconds on {config.device}; they depend on what else ran."
+    caption = (
+        f"Wall-clock seconds on {config.device}, without what is compiled at a first image; they depend on what else "
+        "ran."
+    )
     return Table(columns, rows, caption)

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from filterlab.cli.loading import reading
 from filterlab.cli.options import Channel, Frame
-from filterlab.cli.terminal import show, tell
+from filterlab.cli.terminal import progress_bar, show, tell
 from filterlab.world import RAS, World
 
 if TYPE_CHECKING:
-    import torch
+    import numpy as np
 
     from filterlab.io.bounded import VolumeHeader
 
 BINS = 16
+AT_ONCE = 2**17  # numbers
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Info:
         from rich.table import Table
         from rich.text import Text
 
-        from filterlab.io.volumes import describe, load_volume
+        from filterlab.io.volumes import MAX_BYTES, describe
 
         header = describe(self.file, frame=self.frame, channel=self.channel)
         table = Table(show_header=False, box=None)
@@ -53,9 +55,12 @@ class Info:
             table.add_row(name, Text(value))
         show(table)
         if not self.header_only and _tell_open_choice(header):
+            with progress_bar() as progress:
+                with reading(progress):
+                    samples = header.read(MAX_BYTES)
+                found = _distribution(samples, lambda done: progress(done, "counting"))
             table = Table(show_header=False, box=None)
-            volume = load_volume(self.file, frame=self.frame, channel=self.channel)
-            for name, value in _distribution(volume.samples):
+            for name, value in found:
                 table.add_row(name, Text(value))
             show(table)
 
@@ -67,7 +72,7 @@ def _described(header: VolumeHeader) -> list[tuple[str, str]]:
     def numbers(values: Sequence[float]) -> str:
         return " ".join(f"{v:.6g}" for v in values)
 
-    dtype = str(header.dtype).removeprefix("torch.")
+    dtype = header.sample_type.name
     extent = [n * s for n, s in zip(header.size, header.spacing, strict=True)]
     lines = [
         ("file", f"{header.path} ({header.format}, {header.encoding})"),
@@ -126,27 +131,37 @@ def _tell_open_choice(header: VolumeHeader) -> bool:
     return True
 
 
-def _distribution(samples: torch.Tensor) -> list[tuple[str, str]]:
-    """Range, mean and a histogram of the finite values."""
-    import torch
+def _distribution(samples: np.ndarray, progress: Callable[[float], None]) -> list[tuple[str, str]]:
+    """Range, mean and a histogram of the finite values, in two passes of a megabyte of numbers at a time."""
+    import numpy as np
 
-    values = samples.flatten()
-    lines = []
-    if values.dtype.is_floating_point:
-        finite = values[values.isfinite()]
-        lines += [("not finite", str(values.numel() - finite.numel()))] if finite.numel() < values.numel() else []
-        values = finite
-    if values.numel() == 0:
+    flat, whole = samples.reshape(-1), samples.dtype.kind in "iu"
+    first = range(0, flat.size, AT_ONCE)
+
+    def parts(before: float) -> Iterator[np.ndarray]:
+        for i in first:
+            part = flat[i : i + AT_ONCE]
+            yield part if whole else part[np.isfinite(part)]
+            progress(before + 0.5 * min((i + AT_ONCE) / flat.size, 1.0))
+
+    count, total, extremes = 0, 0.0, []
+    for part in parts(0.0):
+        if part.size:
+            extremes += [part.min(), part.max()]
+            count, total = count + part.size, total + float(part.sum(dtype=np.float64))
+    lines = [("not finite", str(flat.size - count))] if count < flat.size else []
+    if not count:
         return [*lines, ("range", "no finite values")]
-    low, high = (float(v) for v in values.aminmax())
-    lines += [("range", f"{low:.6g} … {high:.6g}"), ("mean", f"{values.double().mean():.6g}")]
+    low, high = float(min(extremes)), float(max(extremes))
+    lines += [("range", f"{low:.6g} … {high:.6g}"), ("mean", f"{total / count:.6g}")]
     if high == low:
         return lines
-    span = high - low
-    bins = min(BINS, int(span) + 1) if not values.dtype.is_floating_point else BINS
-    place = ((values.double() - low) * (bins / (span + (0 if values.dtype.is_floating_point else 1)))).long()
-    counts = torch.bincount(place.clamp_(0, bins - 1), minlength=bins)
-    return lines + _bars(counts.tolist(), low, span + (0 if values.dtype.is_floating_point else 1))
+    bins, span = (min(BINS, int(high - low) + 1), high - low + 1) if whole else (BINS, high - low)
+    counts = np.zeros(bins, np.int64)
+    for part in parts(0.5):
+        place = ((part.astype(np.float64) - low) * (bins / span)).astype(np.int64)
+        counts += np.bincount(place.clip(0, bins - 1), minlength=bins)
+    return lines + _bars(counts.tolist(), low, span)
 
 
 def _bars(counts: list[int], low: float, span: float) -> list[tuple[str, str]]:

@@ -9,7 +9,9 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from filterlab.cli.options import check_asked, check_name, check_not_input
+from filterlab.cli.loading import reading
+from filterlab.cli.options import Quiet, check_asked, check_name
+from filterlab.cli.saving import OutputFile
 from filterlab.cli.scenes import scene_asked_for
 from filterlab.cli.terminal import progress_bar, show, tell
 
@@ -31,21 +33,24 @@ class Mesh:
     scene: Annotated[Positional[Path], arg(metavar="VOLUME | SCENE.yaml")]
     """The volume, with --level; or a scene with a surface."""
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
-    """The mesh to write: a name that ends in .ply, .obj or .stl."""
+    """The mesh to write: a name that ends in .ply, .obj or .stl; a file of that name is replaced."""
     step: float = 1.0
     """Between the points of the grid that triangles are made on, in voxels."""
     outside: str = "lower"
     """Where normals point to: lower values (air in CT), or greater ones."""
     explain: bool = False
     """Show what the mesh would take; no mesh is made."""
+    quiet: Quiet = False
+    """Say nothing of what was written, and show no progress."""
 
     def run(self, overrides: dict[str, str]) -> None:
         from filterlab.io.meshes import check_mesh_file, save_mesh
 
         check_asked(self.output, self.explain, ".ply")
+        output = None
         if self.output is not None:
             check_mesh_file(self.output)
-            check_not_input(self.output, self.scene)
+            output = OutputFile.at(self.output, self.scene, quiet=self.quiet)
         check_name("outside", self.outside, ("lower", "greater"))
         if not 0 < self.step < math.inf:  # a NaN fails too
             raise ValueError(f"expected --step to be a positive number of voxels; got {self.step:g}")
@@ -58,12 +63,13 @@ class Mesh:
         scene = scene_asked_for(self.scene, overrides, self.output)
         if scene.surface is None:
             raise ValueError(f"expected a scene with a surface; this one shows a medium: {self.scene}")
-        prepared = build(scene)
+        with progress_bar(self.quiet) as progress, reading(progress):
+            prepared = build(scene)
         assert isinstance(prepared, PreparedSurface)
-        if self.output is None:
+        if output is None:
             show(table(plan_of_mesh(prepared, self.step)))
             return
-        with progress_bar() as progress:
+        with progress_bar(self.quiet) as progress:
             made = mesh(
                 prepared.surface,
                 self.step,
@@ -72,4 +78,5 @@ class Mesh:
             )
         if not len(made.faces):
             tell(f"no triangles: nothing crosses level {float(prepared.surface.level):g}")
-        save_mesh(made, self.output)
+        save_mesh(made, output.path)
+        output.tell(f"{len(made.faces)} triangles, {len(made.vertices)} vertices")

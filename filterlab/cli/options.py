@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import arg
 
 from filterlab.cli.outcome import UsageError, first_line
+from filterlab.names import unknown_name
 
 Triple = tuple[float, float, float]
 Output = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
 Frame = Annotated[int | None, arg(metavar="T")]
 Channel = Annotated[int | None, arg(metavar="C")]
+Quiet = Annotated[bool, arg(aliases=["-q"])]
 
 
 def check_asked(output: Path | None, explain: bool, ending: str) -> None:
@@ -29,12 +32,10 @@ def check_not_input(output: Path, source: Path) -> None:
         raise ValueError(f"expected an output other than the input; got {output} for both")
 
 
-def check_name(what: str, name: str, known: object) -> None:
-    from filterlab.io.config import unknown_name
-
-    names = [str(k) for k in known]  # type: ignore[attr-defined]
-    if name not in names:
-        raise ValueError(unknown_name(what, name, names))
+def check_name(what: str, name: str, known: Collection[str]) -> None:
+    """Raises ValueError for a name that is not known."""
+    if name not in known:
+        raise ValueError(unknown_name(what, name, known))
 
 
 def check_device(name: str) -> None:

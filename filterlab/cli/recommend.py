@@ -9,8 +9,11 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from filterlab.cli.options import MEMORY, TIME, Channel, Frame, check_name, check_not_input, quantity
+from filterlab import names
+from filterlab.cli.loading import load
+from filterlab.cli.options import MEMORY, TIME, Channel, Frame, Quiet, check_name, quantity
 from filterlab.cli.outcome import NOTHING_FITS, OK
+from filterlab.cli.saving import OutputFile
 from filterlab.cli.terminal import progress_bar, show
 
 
@@ -46,37 +49,38 @@ class Recommend:
     channel: Channel = None
     """Which of several values per voxel, from 0."""
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="SCENE.yaml")] = None
-    """A scene to write, for `filterlab render`."""
+    """A scene to write, for `filterlab render`; a file of that name is replaced."""
     json: bool = False
     """Print the answer as JSON."""
+    quiet: Quiet = False
+    """Say nothing of what was written, and show no progress."""
 
     def run(self, overrides: dict[str, str]) -> int:
-        from filterlab.io.atomic import check_writable
-
         max_error = quantity("--max-error", self.max_error, {"%": 0.01, "": 1.0})
         max_memory = quantity("--max-memory", self.max_memory, MEMORY)
         max_time = quantity("--max-time", self.max_time, TIME)
+        output = None
         if self.output is not None:
             if self.output.suffix.lower() not in (".yaml", ".yml"):
                 raise ValueError(f"expected a scene's name that ends in .yaml; got {self.output}")
-            check_writable(self.output)
-            check_not_input(self.output, self.volume)
-
-        from filterlab.io.volumes import describe, load_volume
-        from filterlab.missing_values import CHOICES, resolved
-        from filterlab.recommendation import TASKS, recommend, report
-        from filterlab.volume import Boundary
+            output = OutputFile.at(self.output, self.volume, quiet=self.quiet)
 
         for what, name, known in (
-            ("task", self.task, TASKS),
-            ("boundary", self.boundary, Boundary),
-            ("nan", self.nan, CHOICES),
+            ("task", self.task, names.TASKS),
+            ("boundary", self.boundary, names.BOUNDARIES),
+            ("nan", self.nan, names.NAN_CHOICES),
         ):
             check_name(what, name, known)
+
+        from filterlab.io.volumes import describe
+        from filterlab.missing_values import resolved
+        from filterlab.recommendation import recommend, report
+
         part = {"frame": self.frame, "channel": self.channel}
         if self.output is not None and len(shape := describe(self.volume, **part).shape) != 3:
             raise ValueError(f"expected one volume (D, H, W) to write a scene of; {self.volume} has {tuple(shape)}")
-        volume = load_volume(self.volume, frame=self.frame, channel=self.channel)
+        with progress_bar(self.quiet) as progress:
+            volume = load(self.volume, self.frame, self.channel, progress)
         file: str | dict[str, Any] = str(self.volume.resolve())
         if chosen := {name: index for name, index in part.items() if index is not None}:
             file = {"file": file, **chosen}
@@ -87,7 +91,7 @@ class Recommend:
                 raise ValueError("expected --nan fill to write a scene with; with propagate its picture has NaN in it")
             low, high = samples.aminmax()
             _check_scene(self.output, report.shown(file, (float(low), float(high)), voxel))
-        with progress_bar() as progress:
+        with progress_bar(self.quiet) as progress:
             found = recommend(
                 volume,
                 max_error,
@@ -102,8 +106,9 @@ class Recommend:
             print(json.dumps(report.data(found), indent=2))
         else:
             show(report.text(found))
-        if self.output is not None:
-            _write_yaml(self.output, report.scene(found, file, voxel))
+        if output is not None:
+            _write_yaml(output.path, report.scene(found, file, voxel))
+            output.tell("a scene")
         return OK if found.pick is not None else NOTHING_FITS
 
 

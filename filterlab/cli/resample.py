@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from filterlab import names
+from filterlab.cli.loading import load
 from filterlab.cli.memory import as_float, check_memory, limit_in_bytes
-from filterlab.cli.options import Channel, Frame, Output, Triple, check_name, check_not_input
+from filterlab.cli.options import Channel, Frame, Output, Quiet, Triple, check_name
 from filterlab.cli.outcome import UsageError
-from filterlab.cli.saving import tell_rounding
-from filterlab.cli.terminal import tell
+from filterlab.cli.saving import OutputFile
+from filterlab.cli.terminal import progress_bar, tell
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
 
     from filterlab.io.bounded import VolumeHeader
@@ -26,9 +29,9 @@ if TYPE_CHECKING:
 class Resample:
     """Put a volume on another grid: finer, coarser, or that of another volume.
 
-    The volume is reconstructed by the chosen method and sampled anew; it stays where it is in the world. Making it
-    coarser does not blur first. Files: NRRD, NIfTI, TIFF stacks, .npy, .npz and .raw with a sidecar are read; .nrrd,
-    .nii, .nii.gz, .npy and .npz are written.
+    The volume is reconstructed by the chosen method and sampled anew; it stays where it is in the world, or is moved by
+    --affine first. Making it coarser does not blur first. Files: NRRD, NIfTI, TIFF stacks, .npy, .npz and .raw with a
+    sidecar are read; .nrrd, .nii, .nii.gz, .npy and .npz are written.
 
     examples:
       filterlab resample engine.nrrd -o fine.nrrd --method notch --spacing 0.5 0.5 0.5
@@ -36,12 +39,14 @@ class Resample:
       filterlab resample pet.nii.gz -o pet_on_ct.nii.gz --like ct.nii.gz --fill 0
       filterlab resample cells.ome.tif -o nuclei.nrrd --channel 1 --frame 0 --spacing 0.2 0.2 0.2
       filterlab resample organs.nii.gz -o organs_on_ct.nii.gz --like ct.nii.gz --labels
+      filterlab resample pet.nii.gz -o pet_on_ct.nii.gz --like ct.nii.gz --affine pet_to_ct.mat --convention fsl
+      filterlab resample pet.nii.gz -o pet_on_ct.nii.gz --like ct.nii.gz --affine 0GenericAffine.mat --convention itk
     """
 
     input: Annotated[Positional[Path], arg(metavar="IN")]
     """The volume: a file, or a folder of numbered TIFF slices."""
     output: Output
-    """The volume to write."""
+    """The volume to write; a file of that name is replaced."""
     method: str = "triquadratic"
     """How values between the voxels are found; `filterlab methods` lists the names."""
     spacing: Annotated[Triple | None, arg(metavar="SX SY SZ")] = None
@@ -50,6 +55,18 @@ class Resample:
     """Instead of it: new number of voxels along x, y, z."""
     like: Annotated[Path | None, arg(metavar="FILE")] = None
     """Instead of it: a volume file whose grid is taken over."""
+    affine: Annotated[Path | None, arg(metavar="FILE")] = None
+    """A 4×4 matrix as text that moves IN first. With none of --spacing, --shape, --like onto the grid that IN had."""
+    convention: str = "world"
+    """What the matrix means. world: it leads points of IN to where they go, in world coordinates as `filterlab info`
+    shows them. itk: a matrix, or a file of ITK, ANTs or 3D Slicer, that leads points of the result to points of IN, in
+    LPS. fsl: FLIRT's -omat, from -in to -ref, in voxels times their sizes."""
+    inverse: bool = False
+    """The matrix was made the other way round, to move onto IN what is moved back now."""
+    flirt_in: Annotated[Path | None, arg(metavar="FILE")] = None
+    """For fsl: the volume that was FLIRT's -in. Default: IN (with --inverse that of --like)."""
+    flirt_ref: Annotated[Path | None, arg(metavar="FILE")] = None
+    """For fsl: the volume that was FLIRT's -ref. Default: that of --like (with --inverse IN)."""
     boundary: str = "mirror"
     """How the volume goes on beyond its ends: mirror, reflect, wrap, border or zeros."""
     nan: str = "refuse"
@@ -59,7 +76,7 @@ class Resample:
     channel: Channel = None
     """Which of several values per voxel, from 0: components of vectors, colours, dyes."""
     fill: float | None = None
-    """The value of voxels outside of IN, for --like; `nan` too. Default: none, the boundary rules there."""
+    """The value of voxels outside of IN, for --like, --affine; `nan` too. Default: none, the boundary rules there."""
     labels: bool = False
     """The values of IN are names, not amounts: of each the method reconstructs where it is, and the strongest wins."""
     dtype: str | None = None
@@ -69,36 +86,37 @@ class Resample:
     """Write NIfTI-2, which fewer tools open; NIfTI-1 rounds numbers of the affine, by 6e-8 of themselves at most."""
     max_gigabytes: float = 8.0
     """The most memory that one volume may take: IN as it is read, or the result as it is computed or written."""
+    quiet: Quiet = False
+    """Say nothing of what was written, and show no progress."""
 
     def run(self, overrides: dict[str, str]) -> None:
-        from filterlab.io.atomic import check_writable
-
-        asked = [self.spacing is not None, self.shape is not None, self.like is not None]
-        if sum(asked) != 1:
+        grids = [self.spacing is not None, self.shape is not None, self.like is not None]
+        if sum(grids) > 1 or (self.affine is None and not any(grids)):
             raise UsageError(
-                "expected one of --spacing, --shape and --like; got " + ("several" if any(asked) else "none")
+                "expected one of --spacing, --shape and --like; got " + ("several" if any(grids) else "none")
             )
-        check_writable(self.output)
-        for path in (self.input, self.like):
-            if path is not None:
-                check_not_input(self.output, path)
+        self._check_convention()
+        output = OutputFile.at(self.output, self.input, self.like, self.affine, quiet=self.quiet)
+
+        check_name("method", self.method, names.methods())
+        check_name("boundary", self.boundary, names.BOUNDARIES)
+        check_name("nan", self.nan, names.NAN_CHOICES)
 
         import numpy as np
-        import torch
 
-        from filterlab.io.volumes import check_saveable, describe, load_volume, save_volume
-        from filterlab.methods import METHODS
-        from filterlab.missing_values import CHOICES
-        from filterlab.resampling import resample
-        from filterlab.volume import Boundary, Volume
+        from filterlab.io.volumes import check_saveable, describe
 
-        check_name("method", self.method, METHODS)
-        check_name("boundary", self.boundary, Boundary)
-        check_name("nan", self.nan, CHOICES)
         source = describe(self.input, frame=self.frame, channel=self.channel)
         source.check_choice()
         target = None if self.like is None else describe(self.like)
+        affine = self._affine(source, target)
         keeps = self.labels or self.method == "nearest"
+
+        import torch
+
+        from filterlab.resampling import resample
+        from filterlab.volume import Volume
+
         stored = _result_type(self.dtype or ("input" if keeps else None), source)
         working = _working_type(stored, source)
         check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)
@@ -107,16 +125,45 @@ class Resample:
         shape = [*source.shape[:-3], *self._new_size(source, target)]
         itemsize = max(working.itemsize, source.dtype.itemsize if keeps else 0, np.dtype(stored or "float32").itemsize)
         check_memory(shape, itemsize, limit)
-        volume = load_volume(self.input, frame=self.frame, channel=self.channel, max_bytes=limit)
         grid: dict = {"spacing": self.spacing} if self.spacing else {"shape": self.shape[::-1] if self.shape else None}
         if target is not None:  # a grid without samples: one voxel, shown over and over
             grid = {"like": Volume.with_geometry(torch.zeros(()).expand(target.shape[-3:]), target.geometry)}
-        if not keeps:
-            _tell_labels(volume, source, self.input)
-        asked = {"dtype": None if keeps or stored is None else working, "labels": self.labels, "fill": self.fill}
-        result = resample(volume, self.method, boundary=self.boundary, nan=self.nan, **asked, **grid)
-        save_volume(_converted(result, stored), self.output, stored=stored, nifti2=self.nifti2)
-        tell_rounding(result, self.output, self.nifti2)
+        grid |= {"affine": affine, "boundary": self.boundary}
+        asked: dict = {"dtype": None if keeps or stored is None else working, "labels": self.labels, "fill": self.fill}
+        with progress_bar(self.quiet) as progress:
+            volume = load(self.input, self.frame, self.channel, progress, limit)
+            if not keeps:
+                _tell_labels(volume, source, self.input)
+            asked["progress"] = lambda done: progress(done, "resampling")
+            result = resample(volume, self.method, nan=self.nan, **asked, **grid)
+            output.save(_converted(result, stored), progress, stored=stored, nifti2=self.nifti2)
+        output.tell_volume(result, self.nifti2)
+
+    def _check_convention(self) -> None:
+        """Raises UsageError for what is said of a matrix that is not there, or that does not ask for it."""
+        from filterlab.io.affines import CONVENTIONS
+
+        check_name("convention", self.convention, CONVENTIONS)
+        about = {"--convention": self.convention != "world", "--inverse": self.inverse}
+        flirt = {"--flirt-in": self.flirt_in is not None, "--flirt-ref": self.flirt_ref is not None}
+        if self.affine is None and (given := [name for name, there in (about | flirt).items() if there]):
+            raise UsageError(f"expected --affine FILE with {given[0]}; got none")
+        if self.convention != "fsl" and any(flirt.values()):
+            raise UsageError(f"expected --convention fsl with --flirt-in and --flirt-ref; got {self.convention}")
+
+    def _affine(self, source: VolumeHeader, target: VolumeHeader | None) -> np.ndarray | None:
+        """The matrix that moves IN; None: there is none."""
+        from filterlab.io.affines import load_affine
+        from filterlab.io.volumes import describe
+
+        if self.affine is None:
+            return None
+        moved, onto = (self.flirt_ref, self.flirt_in) if self.inverse else (self.flirt_in, self.flirt_ref)
+        if self.convention == "fsl" and onto is None and target is None:
+            raise UsageError(f"expected --like or --flirt-{'in' if self.inverse else 'ref'} with --convention fsl")
+        volume = source if moved is None else describe(moved)
+        onto_grid = (target or source) if onto is None else describe(onto)
+        return load_affine(self.affine, self.convention, volume=volume, target=onto_grid, inverse=self.inverse)
 
     def _check_fill(self, stored: str | None) -> None:
         """Raises ValueError for a fill that no integer of the result is."""
@@ -136,7 +183,8 @@ class Resample:
             if min(self.shape) < 1:
                 raise ValueError(f"expected --shape of 1 or more voxels along every axis; got {self.shape}")
             return [as_float(n) for n in self.shape]
-        assert self.spacing is not None
+        if self.spacing is None:
+            return list(source.size)
         if not all(math.isfinite(s) and s > 0 for s in self.spacing):
             raise ValueError(f"expected a --spacing of positive numbers; got {self.spacing}")
         return [max(1.0, n * s / t) for n, s, t in zip(source.size, source.spacing, self.spacing, strict=True)]

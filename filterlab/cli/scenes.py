@@ -43,14 +43,14 @@ def split_overrides(command: type, arguments: Sequence[str]) -> tuple[list[str],
 
     Raises UsageError for a key that is given twice.
     """
-    own = {f"--{f.name}": f.default is False for f in fields(command) if f.name != "scene"}
+    own = {f"--{f.name}": f.default is False for f in fields(command) if f.name != "scene"} | {"-o": False, "-q": True}
     known: list[str] = []
     overrides: dict[str, str] = {}
     rest = list(arguments)
     while rest:
         token = rest.pop(0)
         name, given, _ = token.partition("=")
-        if token == "-o" or name in own:
+        if name in own:
             known.append(token)
             if not (given or own.get(name, False)):
                 known += rest[:1]

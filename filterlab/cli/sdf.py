@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from filterlab.cli.memory import check_memory, limit_in_bytes
-from filterlab.cli.options import Output, Triple, check_name, check_not_input
+from filterlab.cli.options import Output, Quiet, Triple, check_name
 from filterlab.cli.outcome import UsageError
-from filterlab.cli.saving import tell_rounding
+from filterlab.cli.saving import OutputFile
 from filterlab.cli.terminal import progress_bar, tell
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class Sdf:
     input: Annotated[Positional[Path], arg(metavar="MESH")]
     """The mesh."""
     output: Output
-    """The volume to write."""
+    """The volume to write; a file of that name is replaced."""
     size: Annotated[int | None, arg(metavar="N")] = None
     """Voxels along the longest side; default 128."""
     shape: Annotated[tuple[int, int, int] | None, arg(metavar="NX NY NZ")] = None
@@ -51,21 +51,20 @@ class Sdf:
     """Write NIfTI-2, which fewer tools open; NIfTI-1 rounds numbers of the affine, by 6e-8 of themselves at most."""
     max_gigabytes: float = 8.0
     """The most memory that the volume may take."""
+    quiet: Quiet = False
+    """Say nothing of what was written, and show no progress."""
 
     def run(self, overrides: dict[str, str]) -> None:
-        from filterlab.io.atomic import check_writable
-
         asked = [given is not None for given in (self.size, self.shape, self.spacing)]
         if sum(asked) > 1:
             raise UsageError("expected one of --size, --shape and --spacing; got several")
         check_name("dtype", self.dtype, ("float32", "float64"))
-        check_writable(self.output)
-        check_not_input(self.output, self.input)
+        output = OutputFile.at(self.output, self.input, quiet=self.quiet)
 
         import torch
 
         from filterlab.io.meshes import load_mesh
-        from filterlab.io.volumes import check_saveable, save_volume
+        from filterlab.io.volumes import check_saveable
         from filterlab.signed_distances import libigl, signed_distance
 
         check_saveable(self.output, nifti2=self.nifti2)
@@ -75,10 +74,10 @@ class Sdf:
         grid = self._grid(triangles)
         check_memory(grid.size, dtype.itemsize, limit)
         self._tell_open(triangles)
-        with progress_bar() as progress:
+        with progress_bar(self.quiet) as progress:
             volume = signed_distance(triangles, grid, dtype=dtype, progress=lambda done: progress(done, "measuring"))
-        save_volume(volume, self.output, nifti2=self.nifti2)
-        tell_rounding(volume, self.output, self.nifti2)
+            output.save(volume, progress, nifti2=self.nifti2)
+        output.tell_volume(volume, self.nifti2)
 
     def _grid(self, triangles: Triangles) -> Grid:
         from filterlab.signed_distances import Grid

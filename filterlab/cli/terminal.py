@@ -5,6 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from threading import Timer
+
+PATIENCE = 1.0  # seconds for which nothing is shown: what takes no longer has no bar that flashes
 
 
 def tell(message: str) -> None:
@@ -13,18 +16,37 @@ def tell(message: str) -> None:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[float, str], None]]:
-    """A bar on stderr where that is a terminal, else nothing."""
-    if not sys.stderr.isatty():
+def progress_bar(quiet: bool = False) -> Iterator[Callable[[float, str], None]]:
+    """A bar with the time left on stderr where that is a terminal, after a second; else nothing.
+
+    What is yielded is told how much is done, 0 … 1, and of what. With a part that is smaller than before another work
+    begins, whose time is estimated anew.
+    """
+    if quiet or not sys.stderr.isatty():
         yield lambda done, what: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("reading", total=1.0)
-        yield lambda done, what: bar.update(task, completed=done, description=what)
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task("reading", total=1.0)
+
+    def update(done: float, what: str) -> None:
+        if done < bar.tasks[0].completed:
+            bar.reset(task)
+        bar.update(task, completed=done, description=what)
+
+    later = Timer(PATIENCE, bar.start)
+    later.daemon = True
+    later.start()
+    try:
+        yield update
+    finally:
+        later.cancel()
+        later.join()
+        if bar.live.is_started:
+            bar.stop()
 
 
 def show(renderable: object) -> None:

@@ -7,7 +7,7 @@ of gradients flipped where a reflection turned an axis round, and every boundary
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -15,12 +15,13 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from filterlab import ops
 from filterlab.fields.base import Domain, Field, Relevant, check_order, check_points, type_of_rays
 from filterlab.fields.ranges import ranges, straddling
 from filterlab.fields.storage import Quantization, stored_as
 from filterlab.kernels import Factor, Kernel, PiecewisePolynomial
 from filterlab.ops.differentiable import raycast as casting
-from filterlab.ops.differentiable.prefilter import implementation_for, prefilter_samples
+from filterlab.ops.differentiable.prefilter import implementation_for
 from filterlab.ops.pieces import Lattice, Pieces
 from filterlab.ops.place import Placement
 from filterlab.ops.raycast import Candidates, Raycast
@@ -71,9 +72,17 @@ class Scheme(Protocol):
         ...
 
 
-Evaluation = Callable[[Tensor], tuple[Tensor, Tensor | None]]
-"""World points (N, M, 3) -> (N, C, J, M), rows as in `multi_indices(order)`, before points were turned; sign of
-`ops.place`, or None."""
+class Evaluation(Protocol):
+    """The jet of some coefficients at points, with all settled that no point changes."""
+
+    def __call__(self, points: Tensor) -> tuple[Tensor, Tensor | None]:
+        """World points (N, M, 3) -> (N, C, J, M), rows as in `multi_indices(order)`, before points were turned; sign of
+        `ops.place`, or None."""
+        ...
+
+    def of(self, coefficients: Tensor) -> Evaluation:
+        """The same of other coefficients, on the same device, which lie as these do."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -123,7 +132,7 @@ class Coefficients:
         values = samples
         if not prefilter.is_identity:  # periodic coefficients extend as the samples do
             filtered = pad if boundary.periodic else decay
-            values = prefilter_samples(samples, prefilter, boundary, filtered, implementation_for(samples))
+            values = ops.prefilter_samples(samples, prefilter, boundary, filtered, implementation_for(samples))
         if prefilter.is_identity or not boundary.periodic:
             for dim in (-3, -2, -1):
                 values = boundary.extend(values, dim, pad, pad)
@@ -214,12 +223,15 @@ class GridField(Field):
 
     def _settle(self) -> None:
         """Decide everything that points don't: for points of every entry, and for points that all entries share."""
+        own, shared = self._batched()
+        self._own = self._evaluations(own)
+        self._shared = self._own if shared is None else self._evaluations(shared)
+
+    def _batched(self) -> tuple[Tensor, Tensor | None]:
+        """The coefficients (N, C, D', H', W'), and (1, N·C, D', H', W') where that is another shape."""
         values = self.coefficients.values
         own = values if self.channels is not None else values[None, None]
-        self._own = self._evaluations(own)
-        self._shared = self._own
-        if own.shape[0] != 1:
-            self._shared = self._evaluations(own.reshape(1, own.shape[0] * own.shape[1], *own.shape[2:]))
+        return own, own.reshape(1, own.shape[0] * own.shape[1], *own.shape[2:]) if own.shape[0] != 1 else None
 
     def _evaluations(self, values: Tensor) -> list[Evaluation]:
         coefficients, placement = replace(self.coefficients, values=values), self.placement
@@ -263,11 +275,17 @@ class GridField(Field):
         return one
 
     def with_coefficients(self, coefficients: Coefficients) -> GridField:
-        """The same field of other coefficients, which lie as these do."""
+        """The same field of other coefficients, on the same device, which lie as these do."""
         one = copy(self)
         one.coefficients = coefficients
-        one._settle()
+        one._exchange()
         return one
+
+    def _exchange(self) -> None:
+        """Settle for other coefficients only: what does not depend on them is decided."""
+        own, shared = self._batched()
+        self._own = [evaluation.of(own) for evaluation in self._own]
+        self._shared = self._own if shared is None else [evaluation.of(shared) for evaluation in self._shared]
 
     @property
     def tensors(self) -> tuple[Tensor, ...] | None:

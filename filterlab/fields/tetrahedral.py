@@ -547,6 +547,9 @@ class FusedOnTetrahedra:
     near: ops.Evaluation
     everywhere: JetOnTetrahedra
 
+    def of(self, coefficients: Tensor) -> FusedOnTetrahedra:
+        return FusedOnTetrahedra(self.near.of(coefficients), self.everywhere.of(coefficients))
+
     def __call__(self, points: Tensor) -> tuple[Tensor, None]:
         if transformed():
             return self.everywhere(points)
@@ -571,6 +574,9 @@ class JetOnTetrahedra:
     values: Tensor
     placement: Placement
     order: int
+
+    def of(self, coefficients: Tensor) -> JetOnTetrahedra:
+        return replace(self, values=coefficients)
 
     def __call__(self, points: Tensor) -> tuple[Tensor, None]:
         n, m = points.shape[:2]

@@ -83,6 +83,13 @@ class FieldOnTetrahedra(GridField):
 
     def _settle(self) -> None:
         super()._settle()
+        self._keep()
+
+    def _exchange(self) -> None:
+        super()._exchange()
+        self._keep()
+
+    def _keep(self) -> None:
         self._kept = None  # a copy has other coefficients
         first = self._own[0]
         self.evaluated = first.everywhere if isinstance(first, FusedOnTetrahedra) else first  # type: ignore[assignment]

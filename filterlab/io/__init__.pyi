@@ -1,3 +1,4 @@
+from .affines import CONVENTIONS, load_affine
 from .atomic import atomic_write
 from .bounded import VolumeFileError, VolumeHeader
 from .config import ConfigError, StrictModel, dump_config, load_config
@@ -6,6 +7,7 @@ from .meshes import MESH_FORMATS, load_mesh, save_mesh
 from .volumes import FORMATS, describe, load_volume, save_volume
 
 __all__ = [
+    "CONVENTIONS",
     "FORMATS",
     "MESH_FORMATS",
     "ConfigError",
@@ -15,6 +17,7 @@ __all__ = [
     "atomic_write",
     "describe",
     "dump_config",
+    "load_affine",
     "load_config",
     "load_image",
     "load_mesh",

@@ -23,6 +23,10 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
     _check_place(path)
     if path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: expected a file name; got a folder")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise PermissionError(
+            f"cannot write {path}: expected a file that may be replaced; got one that is write-protected"
+        )
     return path
 
 

@@ -13,19 +13,23 @@ import math
 import os
 import re
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from filterlab.geometry import Geometry
 from filterlab.io.warned import warn
-from filterlab.volume import Geometry, Volume
+from filterlab.io.watching import tell_done
 from filterlab.world import UNDECLARED, World
+
+if TYPE_CHECKING:
+    import torch
+
+    from filterlab.volume import Volume
 
 BLOCK = 2**20
 MAX_HEADER_BYTES = 2**20
@@ -36,6 +40,8 @@ MAX_SKIP = 2**26  # bytes passed over in bzip2 data, of which a few hold any num
 # The most that one compressed byte can become: of deflate 258 bytes per 2 bits. Of bzip2 a million and more (268 MB of
 # zeros are 208 bytes): no ratio tells true claims from false ones.
 EXPANSION = {"raw": 1, "deflate": 1032, "gzip": 1032}
+
+BYTE = np.dtype("uint8")
 
 # Stored type -> type of the samples. torch has no arithmetic for uint16 to uint64: they widen to the next signed type,
 # and what int64 cannot hold is refused.
@@ -111,7 +117,7 @@ class VolumeHeader:
         geometry: voxel -> world, and what the file declares of the world.
         encoding: "raw", "gzip", … as the format calls it.
         fields: other lines of the header, for people to read.
-        dtype: of the samples; the stored type, or wider where torch lacks that or values are rescaled.
+        sample_type: of the samples; the stored type, or wider where torch lacks that or values are rescaled.
         choice: which volume of several these samples are.
         held: values that are read to get at the samples, where they are more.
     """
@@ -123,10 +129,10 @@ class VolumeHeader:
     geometry: Geometry
     encoding: str = "raw"
     fields: dict[str, str] = field(default_factory=dict)
-    dtype: torch.dtype = torch.uint8
+    sample_type: np.dtype = BYTE
     choice: Choice = Choice()
     held: int = 0
-    _read: Callable[[], Tensor] | None = field(default=None, repr=False, compare=False)
+    _read: Callable[[], np.ndarray] | None = field(default=None, repr=False, compare=False)
 
     @property
     def size(self) -> tuple[int, int, int]:
@@ -152,18 +158,28 @@ class VolumeHeader:
         return self.geometry.world
 
     @property
+    def dtype(self) -> torch.dtype:
+        """The type of the samples, as torch has it."""
+        import torch
+
+        return getattr(torch, self.sample_type.name)
+
+    @property
     def nbytes(self) -> int:
         """Bytes of the samples in memory, or of what is read to get at them."""
-        return max(math.prod(self.shape), self.held) * max(self.dtype.itemsize, np.dtype(self.stored).itemsize)
+        return max(math.prod(self.shape), self.held) * max(self.sample_type.itemsize, np.dtype(self.stored).itemsize)
 
     def check_choice(self) -> None:
         """Raises VolumeFileError where the file holds several volumes and none was chosen."""
         if len(self.shape) == 3:
             self.choice.check(self.path)
 
-    def read(self, max_bytes: int) -> Tensor:
-        """The samples. Raises VolumeFileError if they need more than `max_bytes`, none of several volumes was chosen,
-        or the file is damaged."""
+    def read(self, max_bytes: int) -> np.ndarray:
+        """The samples, contiguous, writable, in native byte order.
+
+        Raises VolumeFileError if they need more than `max_bytes`, none of several volumes was chosen, or the file is
+        damaged.
+        """
         self.check_choice()
         if self.nbytes > max_bytes:
             raise VolumeFileError(
@@ -172,16 +188,19 @@ class VolumeHeader:
         assert self._read is not None
         samples = self._read()
         assert samples.shape == self.shape
-        assert samples.dtype == self.dtype
+        assert samples.dtype == self.sample_type
         return samples
 
 
-def sample_dtype(path: Path, stored: np.dtype) -> torch.dtype:
-    """The torch type for a stored NumPy type. Raises VolumeFileError for objects, records, complex numbers, text …"""
+def sample_dtype(path: Path, stored: np.dtype) -> np.dtype:
+    """The type that samples of a stored type are held as.
+
+    Raises VolumeFileError for objects, records, complex numbers, text …
+    """
     name = SAMPLE_TYPES.get(stored.name)
     if name is None or stored.shape or stored.fields:
         raise VolumeFileError(path, f"samples of a type among {', '.join(SAMPLE_TYPES)}", f"{str(stored)[:80]}")
-    return getattr(torch, name)
+    return np.dtype(name)
 
 
 def check_size(path: Path, size: Sequence[int]) -> tuple[int, ...]:
@@ -333,7 +352,7 @@ def read_array(
     first = int(np.ravel_multi_index(at[:leading], shape[:leading])) if leading else 0  # type: ignore[arg-type]
     parts, count = math.prod(shape[:leading]), math.prod(shape[leading:]) * dtype.itemsize
     skip_bytes(path, stream, first * count)
-    buffer = read_exactly(path, stream, count, allocate=raw)
+    buffer = read_exactly(path, stream, count, allocate=raw, progress=tell_done)
     skip_bytes(path, stream, (parts - 1 - first) * count)
     _tell_rest(path, stream, parts * count)
     array = native(buffer, dtype, shape[leading:])
@@ -382,7 +401,9 @@ def skip_bytes(path: Path, stream: BinaryIO, count: int) -> None:
         count -= len(block)
 
 
-def read_exactly(path: Path, stream: BinaryIO, count: int, *, allocate: bool) -> bytearray | np.ndarray:
+def read_exactly(
+    path: Path, stream: BinaryIO, count: int, *, allocate: bool, progress: Callable[[float], None] = lambda part: None
+) -> bytearray | np.ndarray:
     """The next `count` bytes. Raises VolumeFileError if there are fewer.
 
     A length that was compared with the file's is allocated at once (`allocate`); else memory grows with what is really
@@ -393,11 +414,13 @@ def read_exactly(path: Path, stream: BinaryIO, count: int, *, allocate: bool) ->
         done = 0
         while done < count and (n := stream.readinto(memoryview(whole)[done : done + 64 * BLOCK])):  # type: ignore[attr-defined]
             done += n
+            progress(done / count)
         buffer = whole
     else:
         buffer = bytearray()
         while len(buffer) < count and (block := stream.read(min(BLOCK, count - len(buffer)))):
             buffer += block
+            progress(len(buffer) / count)
         done = len(buffer)
     if done < count:
         raise VolumeFileError(path, f"{count} bytes of samples", f"the end of the data after {done}")
@@ -412,19 +435,50 @@ def native(buffer: bytearray | np.ndarray, dtype: np.dtype, shape: tuple[int, ..
     return array.reshape(shape)
 
 
-def as_tensor(path: Path, array: np.ndarray, dtype: torch.dtype) -> Tensor:
-    """A contiguous, writable tensor of that type; shares the array's memory where it can.
+def as_samples(path: Path, array: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """A contiguous, writable array of that type; the same one where it can be.
 
     Raises VolumeFileError for unsigned integers of 64 bits that int64 cannot hold.
     """
-    wanted = np.dtype(str(dtype).removeprefix("torch."))
-    if array.dtype == np.uint64 and wanted == np.int64 and array.size and (top := int(array.max())) >= 2**63:
+    if array.dtype == np.uint64 and dtype == np.int64 and array.size and (top := int(array.max())) >= 2**63:
         raise VolumeFileError(path, "uint64 samples below 2⁶³, which int64 holds", top)
-    array = np.ascontiguousarray(array if array.dtype == wanted else array.astype(wanted))
-    return torch.from_numpy(array if array.flags.writeable else array.copy())
+    array = np.ascontiguousarray(array, dtype)
+    return array if array.flags.writeable else array.copy()
 
 
-def storable(path: Path, volume: Volume, types: Sequence[str], stored: str | None = None) -> np.ndarray:
+@dataclass(frozen=True)
+class Outgoing:
+    """Samples on their way into a file: held as they are, and turned block by block into the type that it has.
+
+    `array` is contiguous, `dtype` holds all of its numbers.
+    """
+
+    array: np.ndarray
+    dtype: np.dtype
+
+    @classmethod
+    def of(cls, path: Path, array: np.ndarray, name: str | None) -> Outgoing:
+        """In the type of that name (None: their own). Raises VolumeFileError where it does not hold all samples."""
+        outgoing = cls(array, array.dtype if name is None else np.dtype(name))
+        if outgoing.dtype != array.dtype:
+            for block in outgoing._blocks():
+                check_exact(path, block, outgoing.dtype)
+        return outgoing
+
+    def blocks(self) -> Iterator[np.ndarray]:
+        """The samples in their order and the type of the file, about a megabyte at a time; tells how far it is."""
+        done = 0
+        for block in self._blocks():
+            yield block.astype(self.dtype, copy=False)
+            done += block.size
+            tell_done(done / self.array.size)
+
+    def _blocks(self) -> Iterator[np.ndarray]:
+        flat, step = self.array.reshape(-1), BLOCK // self.array.itemsize
+        yield from (flat[first : first + step] for first in range(0, flat.size, step))
+
+
+def storable(path: Path, volume: Volume, types: Sequence[str], stored: str | None = None) -> Outgoing:
     """The (D, H, W) samples of a volume in one of the types; float16 and bfloat16 widen to float32 where they must.
 
     Args:
@@ -433,20 +487,17 @@ def storable(path: Path, volume: Volume, types: Sequence[str], stored: str | Non
     Raises VolumeFileError for a batch, any other type, or samples that the type that is asked for does not hold.
     """
     samples = volume.samples.detach().cpu()
-    if samples.dtype in (torch.float16, torch.bfloat16):
+    if samples.dtype.is_floating_point and samples.dtype.itemsize == 2:
         samples = samples.float()
     name = stored or str(samples.dtype).removeprefix("torch.")
     if samples.ndim != 3 or name not in types:
         got = f"{volume}" if stored is None else f"{stored} for {volume}"
         raise VolumeFileError(path, f"samples (D, H, W) of a type among {', '.join(types)}", got)
-    return exactly(path, samples.contiguous().numpy(), name)
+    return Outgoing.of(path, samples.contiguous().numpy(), name)
 
 
-def exactly(path: Path, array: np.ndarray, name: str | None) -> np.ndarray:
-    """The same numbers in another type (None: their own). Raises VolumeFileError where it does not hold them all."""
-    if name is None or array.dtype.name == name:
-        return array
-    dtype = np.dtype(name)
+def check_exact(path: Path, array: np.ndarray, dtype: np.dtype) -> None:
+    """Raises VolumeFileError where another type does not hold all of these numbers."""
     with np.errstate(invalid="ignore", over="ignore"):
         converted = array.astype(dtype)
         back = converted.astype(array.dtype)
@@ -456,14 +507,13 @@ def exactly(path: Path, array: np.ndarray, name: str | None) -> np.ndarray:
     elif array.dtype.kind in "iu":
         kept &= converted < 2.0**63  # which comes back as something else, or as the largest int64
     if not kept.all():
-        raise VolumeFileError(path, f"samples that {name} holds exactly", f"{array[~kept].flat[0]}")
-    return converted
+        raise VolumeFileError(path, f"samples that {dtype.name} holds exactly", f"{array[~kept].flat[0]}")
 
 
-def rescaled(array: np.ndarray, slope: float, intercept: float, dtype: torch.dtype) -> Tensor:
+def rescaled(array: np.ndarray, slope: float, intercept: float, dtype: np.dtype) -> np.ndarray:
     """slope · value + intercept, computed in float64 plane by plane and stored as `dtype`."""
-    out = torch.empty(array.shape, dtype=dtype)
+    out = np.empty(array.shape, dtype)
     with np.errstate(over="ignore", invalid="ignore"):
         for source, target in zip(array, out, strict=True):
-            target.copy_(torch.from_numpy(source.astype(np.float64) * slope + intercept))
+            target[...] = source.astype(np.float64) * slope + intercept
     return out

@@ -10,7 +10,6 @@ while an integer is a fine float, a list a fine tuple and a text a fine Path or 
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import os
@@ -26,6 +25,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import to_jsonable_python
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from filterlab.names import shown, unknown_name
 
 MAX_BYTES = 2**20
 MAX_SIDECAR_BYTES = 2**14  # of a small file beside a volume, which is read before anyone trusts it
@@ -61,14 +62,6 @@ class ConfigError(ValueError):
     def __init__(self, problems: Iterable[Problem]) -> None:
         self.problems = tuple(problems)
         super().__init__("\n".join(map(str, self.problems)))
-
-
-def unknown_name(what: str, name: object, known: Iterable[str]) -> str:
-    """The message for a name that nobody knows: "unknown method 'noch'; did you mean 'notch'? known methods: …"."""
-    known = [str(k) for k in known]
-    close = difflib.get_close_matches(str(name).lower(), known, n=1, cutoff=0.5)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"unknown {what} {_shown(name)}; {hint}known {what}s: {', '.join(known) or '(none)'}"
 
 
 def load_config(
@@ -117,7 +110,7 @@ def dump_config(config: BaseModel) -> str:
 def dump_data(data: Any) -> str:
     """The same of plain data: mappings, lists, texts, numbers."""
     _check_finite(data, ())
-    readable = not re.search("[\x85\u2028\u2029\ufeff]", json.dumps(data, ensure_ascii=False))  # PyYAML folds these
+    readable = "\x85" not in json.dumps(data, ensure_ascii=False)  # PyYAML would read it back as a line feed
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=readable, width=120)
 
 
@@ -233,7 +226,7 @@ def _parse(text: str, name: str) -> _Document:
     data, places = _parse_value(text, name)
     data = {} if data is None else data
     if not isinstance(data, dict):
-        raise ConfigError([Problem(f"{name}:1", "", f"expected keys and values (key: value); got {_shown(data)}")])
+        raise ConfigError([Problem(f"{name}:1", "", f"expected keys and values (key: value); got {shown(data)}")])
     return _Document(data, places, name)
 
 
@@ -274,7 +267,7 @@ def _construct(node: Node, path: KeyPath, name: str, places: dict[KeyPath, str])
     for key_node, value_node in node.value:
         key = _scalar(key_node, path) if isinstance(key_node, ScalarNode) else None
         if not isinstance(key, str):
-            got = _shown(key) if isinstance(key_node, ScalarNode) else "a list or mapping"
+            got = shown(key) if isinstance(key_node, ScalarNode) else "a list or mapping"
             raise _RefusedError(key_node, f"{_prefix(path)}expected keys that are text; got {got}")
         here = (*path, key)
         if key in data:
@@ -388,7 +381,7 @@ def _existing(target: Any, part: Key, parents: KeyPath, place: str) -> Key:
     elif isinstance(target, list):
         message = f"expected an index into the list, like [0]; got {part!r}"
     else:
-        message = f"expected keys below it; got {_shown(target)}"
+        message = f"expected keys below it; got {shown(target)}"
     raise ConfigError([Problem(place, key_path(parents), message)])
 
 
@@ -440,14 +433,7 @@ def _problem(document: _Document, model: type[BaseModel], details: Any) -> Probl
 def _expected(message: str, value: Any) -> str:
     head = "Input should be "
     text = message.removeprefix(head) if message.startswith(head) else message[:1].lower() + message[1:]
-    return f"expected {text}; got {_shown(value)}"
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"a section with the keys {', '.join(value)}"[:80] if value else "an empty section"
-    text = "nothing" if value is None else str(value).lower() if isinstance(value, bool) else repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
+    return f"expected {text}; got {shown(value)}"
 
 
 def _data_path(data: Any, location: tuple[Key, ...], kind: str) -> KeyPath:

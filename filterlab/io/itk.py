@@ -24,7 +24,7 @@ from filterlab.io.bounded import (
     Choice,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     beside,
     check_geometry,
     check_size,
@@ -123,7 +123,7 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
 
     def read() -> Any:
         array = _read(path, sitk, names).reshape(frames, *size[::-1], channels)
-        return as_tensor(path, array[t, ..., c], target)
+        return as_samples(path, array[t, ..., c], target)
 
     fields = {"kind": kind} | ({"files": str(len(names))} if path.is_dir() else {})
     held = frames * channels * math.prod(size)
@@ -236,3 +236,21 @@ def _meta_data(path: Path) -> Path | None:
                     raise VolumeFileError(path, "one data file", f"a list of files: {data[:80]!r}")
                 return None if data in ("LOCAL", "Local", "local") else beside(path, data)
     raise VolumeFileError(path, f"ElementDataFile in the first {_MAX_META} bytes of a MetaImage file", "none")
+
+
+def read_affine(path: Path) -> np.ndarray:
+    """The 4×4 matrix of a linear transform in ITK's own coordinates. Raises VolumeFileError."""
+    sitk = require_simpleitk(path, "transforms")
+    try:
+        with _locale_kept():
+            transform = sitk.ReadTransform(str(path))
+    except RuntimeError as error:
+        raise VolumeFileError(path, "4 rows of 4 numbers, or a transform that ITK reads", _reason(error)) from None
+    if transform.GetDimension() != 3 or not transform.IsLinear():
+        got = f"a {transform.GetName()} of {transform.GetDimension()} dimensions"
+        raise VolumeFileError(path, "a linear transform of three dimensions", got)
+    matrix = np.eye(4)
+    matrix[:3, 3] = transform.TransformPoint((0.0, 0.0, 0.0))
+    for axis in range(3):
+        matrix[:3, axis] = np.subtract(transform.TransformPoint(tuple(np.eye(3)[axis])), matrix[:3, 3])
+    return matrix

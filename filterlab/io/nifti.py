@@ -18,17 +18,16 @@ import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from filterlab.io.bounded import (
     Choice,
     Stored,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     check_geometry,
     check_size,
     damaged,
@@ -36,8 +35,10 @@ from filterlab.io.bounded import (
     sample_dtype,
     storable,
 )
-from filterlab.volume import Volume
 from filterlab.world import RAS, NiftiForms, World
+
+if TYPE_CHECKING:
+    from filterlab.volume import Volume
 
 MAX_NIFTI1_AXIS = 32767
 HEADER_BYTES = {348: 352, 540: 544}  # sizeof_hdr -> bytes up to the first possible voxel
@@ -114,7 +115,7 @@ def _checked(
     at = (0 if colours > 1 else c, t, None, None, None, c if colours > 1 else 0)
     slope, intercept = (1.0, 0.0) if colours > 1 else _scaling(path, header)
     plain = (slope, intercept) == (1.0, 0.0)
-    wide = torch.float64 if dtype.itemsize > 2 and dtype.name != "float32" else torch.float32
+    wide = np.dtype("float64" if dtype.itemsize > 2 and dtype.name != "float32" else "float32")
     target = stored_dtype if plain else wide
     affine, world, source = _place(header, kind)
     return VolumeHeader(
@@ -124,12 +125,12 @@ def _checked(
         dtype.name,
         check_geometry(path, affine, world),
         stored.encoding,
-        _fields(header, source, slope, intercept),
+        _fields(header, source, slope, intercept) | _other_sizes(header, affine),
         target,
         choice,
         stored.held(at),
         lambda: (
-            as_tensor(path, stored.read(at), target) if plain else rescaled(stored.read(at), slope, intercept, target)
+            as_samples(path, stored.read(at), target) if plain else rescaled(stored.read(at), slope, intercept, target)
         ),
     )
 
@@ -216,6 +217,13 @@ def _fields(header: Any, source: str, slope: float, intercept: float) -> dict[st
     return {k: v for k, v in fields.items() if v}
 
 
+def _other_sizes(header: Any, affine: np.ndarray) -> dict[str, str]:
+    """The voxel sizes of the header where those of the affine are others, by more than a thousandth."""
+    pixdim = np.abs(header["pixdim"][1:4].astype(np.float64))
+    same = np.allclose(pixdim, np.sqrt((affine[:3, :3] ** 2).sum(axis=0)), rtol=1e-3, atol=0)
+    return {} if same else {"pixdim": " ".join(f"{size:.6g}" for size in pixdim)}
+
+
 def rounding(affine: np.ndarray) -> float:
     """How much the nearest float32 affine differs: the largest change of an entry ÷ that entry, at most 2⁻²⁴ = 6e-8.
 
@@ -246,11 +254,11 @@ def write(volume: Volume, path: Path, stored: str | None = None, nifti2: bool = 
     codes and units; others have an sform, "aligned". float16 and bfloat16, which the format lacks, become float32.
     """
     nibabel = require_nibabel(path)
-    array = storable(path, volume, _WRITTEN, stored)
+    samples = storable(path, volume, _WRITTEN, stored)
     first = version_for(volume, nifti2) == 1
     header = nibabel.Nifti1Header() if first else nibabel.Nifti2Header()
     header.set_data_shape(volume.size)
-    header.set_data_dtype(array.dtype)
+    header.set_data_dtype(samples.dtype)
     header.set_zooms(volume.spacing)
     _set_place(header, volume)
     header["magic"] = b"n+1" if first else b"n+2\0\r\n\x1a\n"
@@ -263,8 +271,8 @@ def write(volume: Volume, path: Path, stored: str | None = None, nifti2: bool = 
         if path.name.lower().endswith(".gz"):
             stream = stack.enter_context(gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0))
         stream.write(start)
-        for plane in array:
-            stream.write(plane.data)
+        for block in samples.blocks():
+            stream.write(block.data)
 
 
 def _set_place(header: Any, volume: Volume) -> None:

@@ -19,7 +19,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from filterlab.io.bounded import (
     Stored,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     beside,
     check_geometry,
     check_size,
@@ -39,8 +39,10 @@ from filterlab.io.bounded import (
     sample_dtype,
     storable,
 )
-from filterlab.volume import Volume
 from filterlab.world import ANATOMICAL, SPACES, UNIT, World
+
+if TYPE_CHECKING:
+    from filterlab.volume import Volume
 
 _TYPES = {
     "int8": ("signed char", "int8", "int8_t"),
@@ -109,7 +111,7 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
         target,
         choice,
         0 if stored is None else stored.held(at),
-        lambda: as_tensor(path, itk.read_nrrd(path, size[::-1], dtype) if stored is None else stored.read(at), target),
+        lambda: as_samples(path, itk.read_nrrd(path, size[::-1], dtype) if stored is None else stored.read(at), target),
     )
 
 
@@ -350,7 +352,7 @@ def _per_axis(
 
 def write(volume: Volume, path: Path, stored: str | None = None) -> None:
     """Writes one attached NRRD file, gzip. float16 and bfloat16, which the format lacks, become float32."""
-    array = storable(path, volume, tuple(_WRITTEN), stored)
+    samples = storable(path, volume, tuple(_WRITTEN), stored)
     affine, world = volume.affine, volume.world
     if world.space in ANATOMICAL:
         affine = np.diag([*ANATOMICAL[world.space], 1.0]) @ affine + 0.0
@@ -358,7 +360,7 @@ def write(volume: Volume, path: Path, stored: str | None = None) -> None:
     lines = [
         "NRRD0005",
         "# https://teem.sourceforge.net/nrrd/format.html",
-        f"type: {_WRITTEN[array.dtype.name]}",
+        f"type: {_WRITTEN[samples.dtype.name]}",
         "dimension: 3",
         f"space: {world.space}" if world.space else "space dimension: 3",
         f"sizes: {' '.join(map(str, volume.size))}",
@@ -372,5 +374,5 @@ def write(volume: Volume, path: Path, stored: str | None = None) -> None:
     with path.open("wb") as file:
         file.write(("\n".join(lines) + "\n\n").encode("ascii"))
         with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:
-            for plane in array:
-                stream.write(plane.data)
+            for block in samples.blocks():
+                stream.write(block.data)

@@ -20,25 +20,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import numpy as np
-import torch
 from pydantic import Field
-from torch import Tensor
 
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import (
-    BLOCK,
     EXPANSION,
     Choice,
+    Outgoing,
     Stored,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     check_geometry,
     check_size,
-    exactly,
     native,
     read_array,
     read_exactly,
@@ -47,7 +44,9 @@ from filterlab.io.bounded import (
     scaled,
 )
 from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, dump_config, load_config
-from filterlab.volume import Volume
+
+if TYPE_CHECKING:
+    from filterlab.volume import Volume
 
 Count = Annotated[int, Field(ge=1)]
 Row = tuple[float, float, float, float]
@@ -134,9 +133,9 @@ class Part:
             shape = (*batch, *shape[2:]) if None in (first, second) else shape[2:]
         return cls(choice, at[::-1] if fortran else at, shape, fortran)
 
-    def tensor(self, path: Path, array: np.ndarray, target: torch.dtype) -> Tensor:
+    def samples(self, path: Path, array: np.ndarray, target: np.dtype) -> np.ndarray:
         """What was read, its axes the right way round."""
-        return as_tensor(path, (array.T if self.fortran else array).reshape(self.shape), target)
+        return as_samples(path, (array.T if self.fortran else array).reshape(self.shape), target)
 
 
 def read_npy_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
@@ -159,7 +158,7 @@ def read_npy_header(path: Path, frame: int | None = None, channel: int | None = 
         target,
         part.choice,
         stored.held(part.at),
-        lambda: part.tensor(path, stored.read(part.at), target),
+        lambda: part.samples(path, stored.read(part.at), target),
     )
 
 
@@ -241,11 +240,11 @@ def read_npz_header(path: Path, frame: int | None = None, channel: int | None = 
         affine = _npz_affine(path, archive, members)
     part = Part.of(path, shape, fortran, frame, channel)
 
-    def read() -> Tensor:
+    def read() -> np.ndarray:
         with _archive(path) as (archive, _), _member(path, archive, info) as stream:
             stream.read(offset)
             array = read_array(path, stream, _stored_order(shape, fortran), dtype, part.at, raw=False)
-        return part.tensor(path, array, target)
+        return part.samples(path, array, target)
 
     return VolumeHeader(
         path,
@@ -296,26 +295,28 @@ def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def _array(path: Path, volume: Volume, stored: str | None) -> np.ndarray:
+def _samples(path: Path, volume: Volume, stored: str | None) -> Outgoing:
     samples = volume.samples.detach().cpu().contiguous()
-    return exactly(path, (samples.float() if samples.dtype == torch.bfloat16 else samples).numpy(), stored)
+    widened = samples.float() if str(samples.dtype) == "torch.bfloat16" else samples
+    return Outgoing.of(path, widened.numpy(), stored)
 
 
 def write_npy(volume: Volume, path: Path, stored: str | None = None) -> None:
     """Writes the samples; bfloat16 becomes float32. The geometry is written by `write_sidecar`."""
     with path.open("wb") as file:
-        write_array(file, _array(path, volume, stored))
+        write_array(file, _samples(path, volume, stored))
         file.flush()
         os.fsync(file.fileno())  # a full disk may tell only now, and must before `write_sidecar`
 
 
-def write_array(file: BinaryIO, array: np.ndarray) -> None:
+def write_array(file: BinaryIO, array: np.ndarray | Outgoing) -> None:
     """An array as .npy. Unlike NumPy's own writer it says why where it fails (a full disk)."""
-    array = np.ascontiguousarray(array).reshape(array.shape)  # a number stays a number
-    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
-    content = array.reshape(-1).view(np.uint8).data
-    for first in range(0, len(content), BLOCK):  # what compresses it need not hold all of it
-        file.write(content[first : first + BLOCK])
+    if not isinstance(array, Outgoing):
+        array = Outgoing(np.ascontiguousarray(array).reshape(array.shape), array.dtype)  # a number stays a number
+    described = {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.array.shape}
+    np.lib.format.write_array_header_1_0(file, described)
+    for block in array.blocks():  # what compresses it need not hold all of it
+        file.write(block.view(np.uint8).data)
 
 
 def write_sidecar(volume: Volume, path: Path) -> None:
@@ -347,6 +348,6 @@ def _described(volume: Volume) -> str | None:
 def write_npz(volume: Volume, path: Path, stored: str | None = None) -> None:
     """Writes `samples` and `affine`, compressed; bfloat16 becomes float32."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-        for name, data in (("samples", _array(path, volume, stored)), ("affine", volume.affine)):
+        for name, data in (("samples", _samples(path, volume, stored)), ("affine", volume.affine)):
             with archive.open(name + _SUFFIX, "w", force_zip64=True) as stream:
                 write_array(stream, data)  # type: ignore[arg-type]

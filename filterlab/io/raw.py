@@ -24,7 +24,7 @@ from filterlab.io.bounded import (
     Stored,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     beside,
     check_geometry,
     check_size,
@@ -32,7 +32,8 @@ from filterlab.io.bounded import (
     sample_dtype,
     scaled,
 )
-from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, load_config, unknown_name
+from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, load_config
+from filterlab.names import unknown_name
 
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -92,5 +93,5 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
         target,
         Choice.of(path, 1, 1, frame, channel),
         0,
-        lambda: as_tensor(path, stored.read(), target),
+        lambda: as_samples(path, stored.read(), target),
     )

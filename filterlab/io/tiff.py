@@ -14,13 +14,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from filterlab.io.bounded import (
     Choice,
     VolumeFileError,
     VolumeHeader,
-    as_tensor,
+    as_samples,
     check_geometry,
     check_size,
     regular_file,
@@ -29,6 +28,7 @@ from filterlab.io.bounded import (
 )
 from filterlab.io.tiff_layouts import MAX_OME, FirstPage, Layout
 from filterlab.io.tiff_pages import DESCRIPTION, Page, TiffFile
+from filterlab.io.watching import tell_done
 from filterlab.world import World
 
 SUFFIXES = (".tif", ".tiff")
@@ -120,12 +120,13 @@ def _pages(path: Path) -> Iterator[Page]:
 
 
 def _read(
-    files: list[Path], shape: tuple[int, ...], target: torch.dtype, wanted: Mapping[int, int], sample: int
-) -> torch.Tensor:
+    files: list[Path], shape: tuple[int, ...], target: np.dtype, wanted: Mapping[int, int], sample: int
+) -> np.ndarray:
     """The slices that are wanted, page -> slice, each of one of the values of its pixels."""
-    samples = torch.empty(shape, dtype=target)
+    samples, last = np.empty(shape, target), max(wanted)
     pages = (page for file in files for page in _pages(file))
     for index, page in enumerate(pages):
         if index in wanted:
-            samples[wanted[index]] = as_tensor(page.directory.file.path, page.read(sample), target)
+            samples[wanted[index]] = as_samples(page.directory.file.path, page.read(sample), target)
+            tell_done((index + 1) / (last + 1))
     return samples

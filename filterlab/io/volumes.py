@@ -17,16 +17,22 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from filterlab.io import itk, nifti, nrrd, numpy_files, raw, tiff
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import VolumeFileError, VolumeHeader, beside, regular_file
-from filterlab.io.config import MAX_SIDECAR_BYTES, load_config, unknown_name
-from filterlab.volume import Volume, as_volume
+from filterlab.io.config import MAX_SIDECAR_BYTES, load_config
+from filterlab.names import unknown_name
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from filterlab.volume import Volume
 
 Writer = Callable[..., None]
+
+MAX_BYTES = 2**33  # that samples may take in memory, where nobody says otherwise
 
 
 @dataclass(frozen=True)
@@ -134,7 +140,7 @@ def describe(path: str | os.PathLike[str], *, frame: int | None = None, channel:
 
 
 def load_volume(
-    path: str | os.PathLike[str], *, frame: int | None = None, channel: int | None = None, max_bytes: int = 2**33
+    path: str | os.PathLike[str], *, frame: int | None = None, channel: int | None = None, max_bytes: int = MAX_BYTES
 ) -> Volume:
     """The volume in a file (or in a folder of TIFF slices).
 
@@ -156,7 +162,11 @@ def load_volume(
         VolumeFileWarning: of what is odd and passed over, such as bytes behind the samples.
     """
     header = describe(path, frame=frame, channel=channel)
-    return Volume.with_geometry(header.read(max_bytes), header.geometry)
+    import torch
+
+    from filterlab.volume import Volume
+
+    return Volume.with_geometry(torch.from_numpy(header.read(max_bytes)), header.geometry)
 
 
 def save_volume(
@@ -184,6 +194,8 @@ def save_volume(
         ValueError, TypeError: a bare tensor that is no volume.
         OSError: the folder is missing or not writable.
     """
+    from filterlab.volume import as_volume
+
     volume = as_volume(volume)
     path = check_saveable(path, batched=volume.batched, nifti2=nifti2)
     known = format_of(path)

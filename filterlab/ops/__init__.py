@@ -20,12 +20,15 @@ from filterlab.kernels import PiecewisePolynomial
 from filterlab.ops.differentiable import gather as sums
 from filterlab.ops.differentiable import operators
 from filterlab.ops.differentiable import place as placement
+from filterlab.ops.differentiable import prefilter as filtering
 from filterlab.ops.differentiable.evaluation import Evaluation
 from filterlab.ops.differentiable.gather import IMPLEMENTATIONS
-from filterlab.ops.differentiable.prefilter import prefilter_axis, prefilter_samples
+from filterlab.ops.differentiable.prefilter import prefilter_axis
 from filterlab.ops.place import Placed, Placement
 from filterlab.ops.stencil import Product, Stencil, multi_indices
 from filterlab.ops.tetrahedra import AnyStencil, TetrahedralStencil
+from filterlab.prefilters import Prefilter
+from filterlab.volume import Boundary
 
 __all__ = [
     "IMPLEMENTATIONS",
@@ -137,6 +140,26 @@ def place(points: Tensor, where: Placement, implementation: str = "reference") -
     if torch.compiler.is_compiling():
         return operators.place(points, operators.placement_text(where), implementation)
     return placement.place(points, where, implementation)
+
+
+def prefilter_samples(
+    samples: Tensor,
+    prefilter: str | Prefilter,
+    boundary: str | Boundary = Boundary.MIRROR,
+    tail: int = 0,
+    implementation: str = "reference",
+) -> Tensor:
+    """Coefficients of a whole volume: `prefilter_axis` along x, y and z.
+
+    Args:
+        samples: (..., D, H, W); the rest as for `prefilter_axis`.
+
+    Returns:
+        (..., D + 2·tail, H + 2·tail, W + 2·tail).
+    """
+    if torch.compiler.is_compiling() and implementation != "reference":
+        return operators.prefilter(samples, operators.filtering_text(prefilter, boundary, tail), implementation)
+    return filtering.prefilter_samples(samples, prefilter, boundary, tail, implementation)
 
 
 def jet(

@@ -15,11 +15,11 @@ from torch import Tensor
 from filterlab.fields.base import Field
 from filterlab.methods import METHODS, reconstruct
 from filterlab.missing_values import resolved
+from filterlab.names import TASKS
 from filterlab.recommendation.errors import ErrorEstimate, MethodErrors, Yardstick
 from filterlab.recommendation.ways import Way, WayCost, costs_of, ways_of
 from filterlab.volume import Boundary, Volume, as_volume
 
-TASKS = ("resample", "dvr", "isosurface")
 STEPS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.125)
 IMAGE = 512  # pixels along a side of the picture whose time is told
 

@@ -9,7 +9,8 @@ and h half of that range,
 For weights ≥ 0 that sum to 1 it is the range itself; else the sums are bounded over all places in a cell (`bound`).
 What rounding may add is added. A brick is *empty* if every interval between control points that the bound touches has
 opacity 0 at both ends: then opacity and its derivatives by value and position are exactly 0 in all of it, so that
-leaving it out changes no bit. A brick with a coefficient that is not finite is never empty.
+leaving it out changes no bit. Nothing is where a coefficient that is read is NaN: such ones are left out of the range,
+and a brick without any other is empty. A brick with an infinite one never is.
 
     coefficients ──▶ ranges (once for a volume) ──▶ with the transfer function: empty or not ──▶ distances
 """
@@ -17,7 +18,7 @@ leaving it out changes no bit. A brick with a coefficient that is not finite is 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -61,7 +62,8 @@ def bricks_of(
     volume = _volume(coefficients, stencil.supports, edge)
     asked = stencil.lowered, _what_is_clear(transfer)
     if volume.answer[0] != asked:
-        empty = transparent(*values(*volume.ranges, stencil.lowered, transfer.positions.dtype), transfer)
+        low, high = volume.ranges
+        empty = transparent(*values(low, high, stencil.lowered, transfer.positions.dtype), transfer) | low.isnan()
         found = Bricks(distances(empty), edge) if bool(empty.any()) else None
         volume.answer = asked, found  # both or, cut off in between, neither
     return volume.answer[1]
@@ -81,8 +83,8 @@ class _Volume:
     """What is known of a volume.
 
     Attributes:
-        ranges: smallest and largest coefficient that every brick's cells read: (bz, by, bx) float64 each; NaN where
-            one is.
+        ranges: smallest and largest coefficient that every brick's cells read: (bz, by, bx) float64 each, of those that
+            are no NaN; NaN where there is no other.
         answer: what was asked last, and the bricks: camera and lights change more often than what is transparent.
     """
 
@@ -110,11 +112,22 @@ def _volume(coefficients: Tensor, supports: tuple[int, int, int], edge: int) -> 
 
 def _ranges(grid: Tensor, supports: tuple[int, int, int], edge: int) -> tuple[Tensor, Tensor]:
     """Every brick reads B coefficients along an axis, and S − 1 that the next one reads too."""
-    low = high = grid
+    low, high = (_over_bricks(extreme, grid, supports, edge) for extreme in (torch.amin, torch.amax))
+    if not bool(low.isnan().any()):  # a NaN is the least of all, and the greatest
+        return low, high
+    unknown = grid.isnan()
+    low, high = (
+        _over_bricks(extreme, grid.masked_fill(unknown, end), supports, edge)
+        for extreme, end in ((torch.amin, torch.inf), (torch.amax, -torch.inf))
+    )
+    nothing = low > high
+    return low.masked_fill(nothing, torch.nan), high.masked_fill(nothing, torch.nan)
+
+
+def _over_bricks(extreme: Callable[..., Tensor], grid: Tensor, supports: tuple[int, int, int], edge: int) -> Tensor:
     for dim, support in enumerate(reversed(supports)):
-        asked = dim, 1 << edge, support - 1
-        low, high = over_windows(torch.amin, low, *asked), over_windows(torch.amax, high, *asked)
-    return low.double(), high.double()
+        grid = over_windows(extreme, grid, dim, 1 << edge, support - 1)
+    return grid.double()
 
 
 # --- values and opacities -------------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from filterlab.io.config import unknown_name
 from filterlab.io.images import from_srgb
+from filterlab.names import unknown_name
 
 GRAY = "gray"
 _WELL_KNOWN = ("viridis", "magma", "inferno", "plasma", "cividis", "turbo", "gray", "bone", "hot", "coolwarm", "RdBu")

@@ -103,8 +103,9 @@ def render(
 
     Returns:
         `(H, W, 4)` (or `(..., 4)` for rays): linear RGB *over the background*, and opacity 1 − T. The image over
-        another background b is rgb + (1 − opacity) (b − background). A NaN of the field makes its pixel NaN. A batched
-        field gives `(N, C, H, W, 4)` (or `(N, C, ..., 4)`), each image with the bits that its own volume would give.
+        another background b is rgb + (1 − opacity) (b − background). Where the field is NaN (missing voxels, under
+        `nan="propagate"`), or the gradient that lights it, nothing is: such a segment has neither colour nor opacity. A
+        batched field gives `(N, C, H, W, 4)` (or `(N, C, ..., 4)`), each image with the bits that its own volume would.
 
         Differentiable (twice) in whatever the field was built from, camera pose or rays, transfer function, shading and
         background. Samples are recomputed in the backward pass, so that memory stays bounded then too; where the march

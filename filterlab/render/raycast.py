@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.reference.optics import dot
-from filterlab.render.camera import Camera
+from filterlab.render.camera import Camera, PerspectiveCamera
 from filterlab.render.image import (
     CENTER,
     Canvas,
@@ -45,7 +45,7 @@ _FRONTAL = (Light(),)
 
 @dataclass(frozen=True)
 class Casting:
-    """What is cast, and how; see `raycast`."""
+    """What is cast, and how; see `raycast`. In `seen` first hits are looked for, where less than all will do."""
 
     surface: Surface
     material: Material
@@ -55,6 +55,7 @@ class Casting:
     sheets: int
     shadows: bool
     dtype: torch.dtype
+    seen: Surface | None = None
 
     def __call__(self, origins: Tensor, directions: Tensor, channels: Sequence[str]) -> Tensor:
         """The channels of rays (R, 3), side by side (R, width)."""
@@ -74,20 +75,21 @@ class Casting:
     def eye(self, seen: PixelRays, channels: Sequence[str]) -> Eye:
         """The same, for finding edges in those channels; in float64, or both sides of one would be the same ray."""
         exact = replace(self, dtype=torch.float64)
-        counting = replace(exact, sheets=COUNTED)
+        counting = replace(exact, seen=None, sheets=COUNTED)
         radiance = lambda o, d: exact(o, d, channels)  # noqa: E731
         return Eye(self.surface, self.region, seen.rays, lambda inside: counting._hits(inside).t, radiance)
 
     def _hits(self, inside: Spans) -> Hits:
         """Those within the spans: t (R, k) from where rays enter."""
         entry, direction = (x.to(self.dtype) for x in (inside.entry, inside.direction))
+        surface = self.seen or self.surface
         if self.sheets == 1:
-            t = self.surface.hit(entry, direction).t[:, None]
+            hits = surface.hit(entry, direction).as_sheets()
         else:
-            t = self.surface.hits(entry, direction, self.sheets).t
+            hits = surface.hits(entry, direction, self.sheets)
         length = inside.length.detach().to(self.dtype)[:, None]
         slack = 8 * torch.finfo(self.dtype).eps * self.surface.domain.diagonal
-        return Hits(torch.where((length > 0) & (t.detach() <= length + slack), t, torch.inf))
+        return hits.where((length > 0) & (hits.t.detach() <= length + slack))
 
     def _color(self, at: SurfacePoints, hits: Hits, directions: Tensor) -> Tensor:
         """Sheets in front of each other, from the eye on, over the background: RGB and opacity (R, 4)."""
@@ -176,11 +178,12 @@ def raycast(
         pixel's hit moves. It comes and goes only with `silhouettes`, of which there are first derivatives.
 
     Raises:
-        TypeError: no surface, camera, material or silhouettes. ValueError: numbers out of range, channels that are not
-            known, more than one ray a pixel for other channels than the colour, silhouettes of rays without a camera.
+        TypeError: no surface, camera, material or silhouettes; silhouettes of a surface in pieces. ValueError: numbers
+            out of range, channels that are not known, more than one ray a pixel for other channels than the colour,
+            silhouettes of rays without a camera.
     """
     _check(surface, material, sheets, subpixels, channels, dtype, camera)
-    _check_silhouettes(silhouettes, camera)
+    _check_silhouettes(silhouettes, surface, camera)
     check_camera(camera)
     device = torch.device(device or device_of(camera) or "cpu")
     seen = PixelRays.of(camera, size, device)
@@ -194,6 +197,7 @@ def raycast(
         sheets,
         shadows,
         dtype,
+        _seen(surface, camera, sheets),
     )
     at_once = max(sheets, silhouettes.lines * silhouettes.parts if silhouettes else 1)
     canvas = Canvas(seen, None, torch.is_grad_enabled(), sum(CHANNELS[name] for name in asked))
@@ -209,6 +213,13 @@ def raycast(
         return image
     widths = [CHANNELS[name] for name in asked]
     return dict(zip(asked, image.split(widths, -1), strict=True))
+
+
+def _seen(surface: Surface, camera: Camera | RayTensors, sheets: int) -> Surface | None:
+    """What is left of a surface for first hits of rays from one eye."""
+    if sheets > 1 or not isinstance(camera, PerspectiveCamera):
+        return None
+    return surface.seen_from(torch.as_tensor(camera.position, dtype=torch.float64).detach())
 
 
 def _mean(
@@ -268,8 +279,10 @@ def _check(
         raise ValueError("one ray a pixel for other channels than the colour: depths and normals have no mean")
 
 
-def _check_silhouettes(silhouettes: Silhouettes | None, camera: object) -> None:
+def _check_silhouettes(silhouettes: Silhouettes | None, surface: Surface, camera: object) -> None:
     if not isinstance(silhouettes, Silhouettes | None):
         raise TypeError(f"silhouettes must be Silhouettes(lines, parts), or None; got {type(silhouettes).__name__}")
     if silhouettes is not None and not isinstance(camera, Camera):
         raise ValueError("silhouettes go with a camera: rays alone have no pixels that edges could sweep over")
+    if silhouettes is not None and surface.in_pieces:
+        raise TypeError(f"silhouettes are those of one function, as a level set has; got {type(surface).__name__}")

@@ -28,7 +28,7 @@ class TransferFunction(Table):
 
     α(v) = (1−w) α_j + w α_{j+1}, w = (v − x_j)/(x_{j+1} − x_j), likewise linear RGB; constant beyond both ends, and
     exact at every control point. What is interpolated is α, the opacity of `unit` world length; the extinction
-    −log1p(−α)/unit follows from it. A value of NaN gives NaN, so that a defect shows instead of vanishing.
+    −log1p(−α)/unit follows from it. A value of NaN is none: it has opacity 0, colour 0 and no derivative.
 
     Args:
         positions: `(M,)` increasing scalars x_j.
@@ -141,8 +141,10 @@ class TransferFunction(Table):
         """(linear RGB `(..., 3)`, opacity per unit `(...)`) of values `(...)`, in promote(value, float32)."""
         value = value.to(torch.promote_types(value.dtype, torch.float32))
         function = self.to(value.dtype, value.device)
-        located = function.locate(value)
-        return function.color(located), function.opacity(located)
+        unknown = value.detach().isnan()
+        located = function.locate(torch.where(unknown, function.positions[0].detach(), value))
+        rgb, alpha = function.color(located), function.opacity(located)
+        return torch.where(unknown[..., None], 0, rgb), torch.where(unknown, 0, alpha)
 
 
 def _scalar(value: Numbers | float) -> Tensor:

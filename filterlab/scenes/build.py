@@ -253,5 +253,8 @@ def _volume(scene: Scene) -> Volume | None:
 
 
 def _range(samples: Tensor) -> tuple[float, float]:
+    """Of the samples that have a value; as they are where none has."""
     low, high = samples.aminmax()
+    if not (low.isfinite() and high.isfinite()) and bool((known := samples.isfinite()).any()):
+        low, high = samples[known].aminmax()
     return float(low), float(high)

@@ -1,14 +1,29 @@
 """Surfaces: what a ray can hit, exactly.
 
-    Field ──▶ LevelSet ──hit(rays)──▶ Hits ──at(rays, hits)──▶ points, normals, curvatures
-                 └──────mesh(…)─────▶ triangles
+    Field ────────────▶ LevelSet ──hit(rays)──▶ Hits ──at(rays, hits)──▶ points, normals, curvatures
+    A, b, c in bounds ▶ Quadrics ──────┘
+                        LevelSet ──mesh(…)────▶ triangles
 
 Every surface finds its hits in its own way; derivatives of a hit, and what is known of the surface there, are written
 once (`surfaces.base`).
 """
 
 from filterlab.surfaces.base import Hits, Surface, SurfacePoints
+from filterlab.surfaces.bounds import Bounds, Planes, Spheres, Tetrahedra
 from filterlab.surfaces.level_set import LevelSet
 from filterlab.surfaces.meshes import Mesh, mesh
+from filterlab.surfaces.quadrics import Quadrics
 
-__all__ = ["Hits", "LevelSet", "Mesh", "Surface", "SurfacePoints", "mesh"]
+__all__ = [
+    "Bounds",
+    "Hits",
+    "LevelSet",
+    "Mesh",
+    "Planes",
+    "Quadrics",
+    "Spheres",
+    "Surface",
+    "SurfacePoints",
+    "Tetrahedra",
+    "mesh",
+]

@@ -10,7 +10,7 @@ which is evaluated once more, at a hit with derivatives, where derivatives of it
 any order, and t keeps its bits. Backward passes keep the rays and t; they cost a gather, a pull and a splat. Of
 surfaces that cannot tell their numbers two steps of Newton's method are recorded instead, t ← t − F(o + t d) / s, each
 right to one more order. s is the derivative of F along the ray itself, whatever a field gives as its gradient. Where it
-is 0, at tangents, a hit has no derivative, and gets 0.
+is 0, at tangents, a hit has no derivative, and gets 0. The same where it is not known: at hits beside what is missing.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from filterlab.ops.differentiable.recording import transforming
 MAX_SHEETS = 4096
 _STEPS = 2  # of Newton's method: derivatives up to the second
 _FAR = 64  # diameters of the domain from which on o + t d is polished
+_BESIDE = 1e-3  # voxels from a hit, along its ray, to where derivatives are looked for that are none at it
 _POLISH = 1e-3  # of a voxel, by at most: rays that are nearly tangents turn the rounding of o + t d into long ways
 
 
@@ -40,14 +41,30 @@ class Hits:
 
     Attributes:
         t: (...) in units of each ray's direction, ∞ where there is none; differentiable.
+        piece: (...) int64, which piece of the surface is hit, −1 where none is; None: it has no pieces.
     """
 
     t: Tensor
+    piece: Tensor | None = None
 
     @property
     def valid(self) -> Tensor:
         """(...) bool."""
         return self.t.detach() < torch.inf
+
+    def where(self, kept: Tensor) -> Hits:
+        """Those of a mask that broadcasts to (...), none elsewhere."""
+        piece = None if self.piece is None else torch.where(kept, self.piece, -1)
+        return Hits(torch.where(kept, self.t, torch.inf), piece)
+
+    def as_sheets(self) -> Hits:
+        """(..., 1): the same as one sheet of hits."""
+        return Hits(self.t[..., None], None if self.piece is None else self.piece[..., None])
+
+    def of_rays(self, shape: Sequence[int], dtype: torch.dtype) -> Hits:
+        """In another shape and type, without derivatives."""
+        piece = None if self.piece is None else self.piece.reshape(tuple(shape))
+        return Hits(self.t.detach().reshape(tuple(shape)).to(dtype), piece)
 
 
 class SurfacePoints(NamedTuple):
@@ -55,7 +72,7 @@ class SurfacePoints(NamedTuple):
 
     Attributes:
         point: (..., 3), in the world.
-        gradient: ∇F (..., 3) per world unit, as the field gives it; None for order 0.
+        gradient: ∇F (..., 3) per world unit, as the field gives it, and 0 where that is NaN; None for order 0.
         normal: ∇F / |∇F| (..., 3), towards greater values; 0 where the gradient is.
         curvatures: κ₁ ≥ κ₂ (..., 2) per world unit: along a principal direction v the normal n turns by ∂n/∂v = κ v, so
             that a ball of greater values than around it has −1/r twice; None below order 2.
@@ -70,15 +87,17 @@ class SurfacePoints(NamedTuple):
 
 
 class Surface(ABC):
-    """The zeros of a function in a domain.
+    """The zeros of a function in a domain, or of one function for each of many pieces.
 
     Attributes:
         domain: the box that the surface lies in.
         max_order: of derivatives of F: 2 where curvatures can be given.
+        in_pieces: whether F is another one for every piece: then hits tell theirs.
     """
 
     domain: Domain
     max_order: int
+    in_pieces: bool = False
 
     @property
     def device(self) -> torch.device | None:
@@ -86,8 +105,8 @@ class Surface(ABC):
         return None
 
     @abstractmethod
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
-        """F, and its gradient and Hessian up to an order, at world points (..., 3)."""
+    def jet(self, points: Tensor, order: int, piece: Tensor | None = None) -> tuple[Tensor, ...]:
+        """F, and its gradient and Hessian up to an order, at world points (..., 3); of a piece for each, (...)."""
 
     @property
     @abstractmethod
@@ -103,13 +122,17 @@ class Surface(ABC):
         """The same surface, made of others in place of `tensors`."""
         raise TypeError(f"{type(self).__name__} cannot tell its tensors")
 
-    @abstractmethod
-    def _first(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """t (...) of the first hit of rays (..., 3), ∞ where none."""
+    def seen_from(self, eye: Tensor) -> Surface:
+        """What has the same first hits for all rays from a world point (3,), and may be cast sooner."""
+        return self
 
     @abstractmethod
-    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
-        """t (R, sheets) of the first hits in order, or of the last ones from the last on; ∞ where no more."""
+    def _first(self, origins: Tensor, directions: Tensor) -> Hits:
+        """The first hits (...) of rays (..., 3)."""
+
+    @abstractmethod
+    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
+        """The first hits (R, sheets) in order, or the last ones from the last on."""
 
     def hit(self, origins: Tensor, directions: Tensor) -> Hits:
         """The first hit of every ray in the domain, t ≥ 0.
@@ -125,12 +148,11 @@ class Surface(ABC):
             TypeError, ValueError: no such rays: another type or shape, numbers that are not finite, no direction.
         """
         origins, directions = check_rays(origins, directions)
-        t = self._searched(origins, directions)
-        return Hits(self._attached(t, origins, directions))
+        return self._attached(self._searched(origins, directions), origins, directions)
 
     def met(self, origins: Tensor, directions: Tensor) -> Tensor:
         """Whether rays hit it at all, (...) bool; arguments and errors as for `hit`. Nothing is recorded."""
-        return self._searched(*check_rays(origins, directions)) < torch.inf
+        return self._searched(*check_rays(origins, directions)).valid
 
     def hits(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool = False) -> Hits:
         """The first `sheets` hits of every ray in order; the last ones, from the last on, where `farthest`.
@@ -148,9 +170,8 @@ class Surface(ABC):
         check_sheets(sheets)
         origins, directions = check_rays(origins, directions)
         o, d = (x.detach().reshape(-1, 3) for x in (origins, directions))
-        t = self.detached._sheets(o, d, sheets, farthest).detach()
-        t = t.reshape(*origins.shape[:-1], sheets).to(origins.dtype)
-        return Hits(self._attached(t, origins[..., None, :], directions[..., None, :]))
+        found = self.detached._sheets(o, d, sheets, farthest).of_rays((*origins.shape[:-1], sheets), origins.dtype)
+        return self._attached(found, origins[..., None, :], directions[..., None, :])
 
     def at(self, origins: Tensor, directions: Tensor, hit: Hits, order: int = 1) -> SurfacePoints:
         """What is known of the surface at hits.
@@ -174,103 +195,128 @@ class Surface(ABC):
             origins, directions = origins[..., None, :], directions[..., None, :]
         elif shape != rays:
             raise ValueError(f"hits of rays {tuple(rays)} have t of that shape, or (..., k); got {tuple(shape)}")
+        if self.in_pieces and hit.piece is None:
+            raise ValueError(f"hits of {type(self).__name__} tell which piece is hit; got hits with piece=None")
         index = _where(hit.valid)
         o, d, t = _chosen(index, shape, origins, directions, hit.t[..., None])
-        point = self._polished(o, d, t[:, 0])
-        rows = _geometry(point, self.jet(point, order)[1:]) if order else SurfacePoints(point)
+        piece = _chosen_pieces(index, hit)
+        point = self._polished(o, d, t[:, 0], piece)
+        rows = _geometry(point, self._derivatives(point, d, order, piece)) if order else SurfacePoints(point)
         return SurfacePoints(*_spread([row for row in rows if row is not None], index, shape))
 
-    def _searched(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """t (...) of first hits in the type of the rays, without derivatives."""
-        return self.detached._first(origins.detach(), directions.detach()).detach().to(origins.dtype)
+    def _derivatives(self, points: Tensor, directions: Tensor, order: int, piece: Tensor | None) -> tuple[Tensor, ...]:
+        """Gradient, and Hessian, at hits (M, 3); where they are NaN, beside what is missing, just before or behind."""
+        rows = self.jet(points, order, piece)[1:]
+        unknown = _unknown(rows)
+        if not bool(unknown.any()):
+            return rows
+        apart = directions.detach() * (_BESIDE * self.domain.voxel_size / directions.detach().norm(dim=-1))[:, None]
+        for step in (-apart, apart):
+            points = torch.where(unknown[:, None], points + step, points)
+            unknown = _unknown(self.detached.jet(points.detach(), order, piece)[1:])
+            points = torch.where(unknown[:, None], points - step, points)
+        known = _where(~unknown)  # 0 · NaN is NaN: the others must not be in the graph
+        own = None if piece is None else piece.index_select(0, known)
+        rows = self.jet(points.index_select(0, known), order, own)[1:]
+        return tuple(row.new_zeros(len(points), *row.shape[1:]).index_copy(0, known, row) for row in rows)
 
-    def _value(self, points: Tensor) -> Tensor:
-        return self.jet(points, 0)[0]
+    def _searched(self, origins: Tensor, directions: Tensor) -> Hits:
+        """First hits (...) in the type of the rays, without derivatives."""
+        found = self.detached._first(origins.detach(), directions.detach())
+        return found.of_rays(origins.shape[:-1], origins.dtype)
 
-    def _differentiated(self, points: Tensor, tensors: Sequence[Tensor] | None = None) -> tuple[Tensor, Tensor]:
+    def _value(self, points: Tensor, piece: Tensor | None) -> Tensor:
+        return self.jet(points, 0, piece)[0]
+
+    def _differentiated(
+        self, points: Tensor, piece: Tensor | None, tensors: Sequence[Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
         """F at points (M, 3), to be differentiated by its tensors (or these in their place), and its true gradient."""
         with torch.enable_grad():
             x = points.detach().requires_grad_()
-            value = (self if tensors is None else self.with_tensors(tensors))._value(x)
+            value = (self if tensors is None else self.with_tensors(tensors))._value(x, piece)
             (gradient,) = torch.autograd.grad(value.sum(), x, retain_graph=True)
         return value, gradient
 
-    def _slope(self, points: Tensor, directions: Tensor) -> Tensor:
-        return _along_rays(self._differentiated(points)[1], directions.detach())
+    def _slope(self, points: Tensor, directions: Tensor, piece: Tensor | None) -> Tensor:
+        return _along_rays(self._differentiated(points, piece)[1], directions.detach())
 
-    def _attached(self, t: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
-        """The same t, with derivatives."""
-        tensors = None if transforming() else self.tensors
+    def _attached(self, hit: Hits, origins: Tensor, directions: Tensor) -> Hits:
+        """The same hits, with derivatives."""
+        tensors, t = None if transforming() else self.tensors, hit.t
         if not torch.is_grad_enabled() or (tensors is not None and not _asked(origins, directions, *tensors)):
-            return t
-        index = _where(t < torch.inf)
-        if not len(index) or not self._follows(*_chosen(index[:1], t.shape, origins, directions, t[..., None])):
-            return t
+            return hit
+        index = _where(hit.valid)
+        if not len(index) or not self._follows(index[:1], hit, origins, directions):
+            return hit
         o, d, own = _chosen(index, t.shape, origins, directions, t[..., None])
-        own = own[:, 0]
-        own = self._stepped(o, d, own) if tensors is None else _Attached.apply(self, own, o, d, *tensors)
-        return t.flatten().index_copy(0, index, own).reshape(t.shape)
+        own, piece = own[:, 0], _chosen_pieces(index, hit)
+        own = self._stepped(o, d, own, piece) if tensors is None else _Attached.apply(self, piece, own, o, d, *tensors)
+        return Hits(t.flatten().index_copy(0, index, own).reshape(t.shape), hit.piece)
 
-    def _follows(self, origins: Tensor, directions: Tensor, t: Tensor) -> bool:
-        """Whether hits move with anything that derivatives are asked by."""
-        return self._value(origins + t * directions).requires_grad
+    def _follows(self, index: Tensor, hit: Hits, origins: Tensor, directions: Tensor) -> bool:
+        """Whether those hits move with anything that derivatives are asked by."""
+        o, d, t = _chosen(index, hit.t.shape, origins, directions, hit.t[..., None])
+        return self._value(o + t * d, _chosen_pieces(index, hit)).requires_grad
 
-    def _stepped(self, origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
+    def _stepped(self, origins: Tensor, directions: Tensor, t: Tensor, piece: Tensor | None) -> Tensor:
         """t (M,) with the derivatives of steps of Newton's method."""
-        slope = self._slope(_along(origins, directions, t), directions)
+        slope = self._slope(_along(origins, directions, t), directions, piece)
         for _ in range(_STEPS):
-            value = self._value(_along(origins, directions, t))
-            t = t - (value - value.detach()) / slope
+            value = self._value(_along(origins, directions, t), piece)
+            t = t - torch.where(value.isnan(), 0, value - value.detach()) / slope
         return t
 
-    def _polished(self, origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
+    def _polished(self, origins: Tensor, directions: Tensor, t: Tensor, piece: Tensor | None) -> Tensor:
         """o + t d; far from where rays begin moved along them by what it was rounded by."""
         point = _along(origins, directions, t)
         near = _FAR * (self.domain.diagonal + max(map(abs, self.domain.center)))
         if not len(t) or max(map(abs, torch.stack(origins.detach().aminmax()).tolist())) <= near:
             return point
         far = origins.detach().abs().amax(-1) > near  # t d leads as far, for what is hit is near
-        moved = self.detached._nearer(point.detach()[far], directions.detach()[far]).detach()
+        own = None if piece is None else piece[far]
+        moved = self.detached._nearer(point.detach()[far], directions.detach()[far], own).detach()
         return point.index_add(0, far.nonzero()[:, 0], moved)
 
-    def _nearer(self, points: Tensor, directions: Tensor) -> Tensor:
+    def _nearer(self, points: Tensor, directions: Tensor, piece: Tensor | None) -> Tensor:
         """By what points (M, 3) come nearer to the surface along rays: steps of Newton's method that lower |F|."""
         most = _POLISH * self.domain.voxel_size / directions.norm(dim=-1)
         moved = torch.zeros_like(points)
         for _ in range(_STEPS):
-            value = self._value(points + moved)
-            step = -value / self._slope(points + moved, directions)
+            value = self._value(points + moved, piece)
+            step = -value / self._slope(points + moved, directions, piece)
             new = moved + step.clamp(-most, most)[:, None] * directions
-            moved = torch.where((self._value(points + new).abs() < value.abs())[:, None], new, moved)
+            moved = torch.where((self._value(points + new, piece).abs() < value.abs())[:, None], new, moved)
         return moved
 
 
 class _Attached(torch.autograd.Function):
-    """(surface, t (M,), origins, directions (M, 3), its tensors) -> t, which moves as F(o + t d) = 0 demands."""
+    """(surface, piece, t (M,), origins, directions (M, 3), its tensors) -> t, which moves as F(o + t d) = 0 demands."""
 
     @staticmethod
-    def forward(ctx, surface: Surface, t: Tensor, *moving: Tensor):
-        ctx.surface = surface
+    def forward(ctx, surface: Surface, piece: Tensor | None, t: Tensor, *moving: Tensor):
+        ctx.surface, ctx.piece = surface, piece
         ctx.save_for_backward(t, *moving)
         return t.clone()
 
     @staticmethod
     def backward(ctx, *cotangents: Tensor):
         t, origins, directions, *tensors = ctx.saved_tensors
-        needed = ctx.needs_input_grad[4:]
+        needed = ctx.needs_input_grad[5:]
         if torch.is_grad_enabled():
-            t = _Attached.apply(ctx.surface, t, origins, directions, *tensors)
+            t = _Attached.apply(ctx.surface, ctx.piece, t, origins, directions, *tensors)
             tensors = [x.view_as(x) for x in tensors]  # t depends on them as well
             points = _along(origins, directions, t)
-            value = ctx.surface.with_tensors(tensors)._value(points)
+            value = ctx.surface.with_tensors(tensors)._value(points, ctx.piece)
             (gradient,) = torch.autograd.grad(value.sum(), points, create_graph=True)
         else:
             tensors = [x.detach().requires_grad_(need) for x, need in zip(tensors, needed, strict=True)]
             points = _along(origins, directions, t)
-            value, gradient = ctx.surface._differentiated(points, tensors)
+            value, gradient = ctx.surface._differentiated(points, ctx.piece, tensors)
+        gradient = torch.where(gradient.isnan(), 0, gradient)
         weight = -cotangents[0] / _along_rays(gradient, directions)
         by_rays = weight[:, None] * gradient, (weight * t)[:, None] * gradient
-        return None, None, *by_rays, *_by_tensors(value, tensors, needed, weight)
+        return None, None, None, *by_rays, *_by_tensors(value, tensors, needed, weight)
 
 
 def _by_tensors(value: Tensor, tensors: Sequence[Tensor], needed: Sequence[bool], weight: Tensor):
@@ -284,9 +330,9 @@ def _by_tensors(value: Tensor, tensors: Sequence[Tensor], needed: Sequence[bool]
 
 
 def _along_rays(gradient: Tensor, directions: Tensor) -> Tensor:
-    """s = g·d (M,); 1 / s is 0 where it is 0: ∞ stands there."""
+    """s = g·d (M,); 1 / s is 0 where it is 0, or NaN: ∞ stands there."""
     slope = (gradient * directions).sum(-1)
-    return torch.where(slope == 0, torch.inf, slope)
+    return torch.where(slope.abs() > 0, slope, torch.inf)
 
 
 def check_sheets(sheets: int) -> None:
@@ -347,9 +393,19 @@ def _where(mask: Tensor) -> Tensor:
     return torch.from_numpy(np.flatnonzero(flat.numpy())) if flat.device.type == "cpu" else flat.nonzero()[:, 0]
 
 
+def _unknown(rows: Sequence[Tensor]) -> Tensor:
+    """(M,) whether any number of rows (M, …) is NaN."""
+    return torch.stack([row.detach().flatten(1).isnan().any(1) for row in rows]).any(0)
+
+
 def _chosen(index: Tensor, shape: torch.Size, *rows: Tensor) -> list[Tensor]:
     """Of rows that broadcast to (*shape, k), those at flat places: (M, k)."""
     return [x.expand(*shape, x.shape[-1]).reshape(-1, x.shape[-1]).index_select(0, index) for x in rows]
+
+
+def _chosen_pieces(index: Tensor, hit: Hits) -> Tensor | None:
+    """Those at flat places: (M,)."""
+    return None if hit.piece is None else hit.piece.flatten().index_select(0, index)
 
 
 def _spread(rows: Sequence[Tensor], index: Tensor, shape: torch.Size) -> list[Tensor]:

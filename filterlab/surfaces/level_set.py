@@ -13,7 +13,7 @@ others the root search of `filterlab.roots` cannot miss one. Nothing is stepped,
 | the field jumps over the level from one piece to the next | one hit, at the knot |
 | a ray begins inside, or on the surface | as any other: a surface has no inside; t = 0 where f(o) = level |
 | the surface leaves the domain | it ends there, open |
-| coefficients that are not finite | no hit in cells that read them: a hole |
+| coefficients that are not finite | no hit in cells that read them: the surface ends there, open |
 | a level that no value has | no hit |
 """
 
@@ -28,7 +28,7 @@ from torch import Tensor
 
 from filterlab.fields.base import Field, Relevant
 from filterlab.roots import MAX_DEGREE, all_roots
-from filterlab.surfaces.base import Surface
+from filterlab.surfaces.base import Hits, Surface
 
 RAYS_AT_ONCE = 1 << 16  # whose sheets are sorted
 _PLACES_APART = 32  # roundings of a place on a ray, up to which two are the same
@@ -57,7 +57,7 @@ class LevelSet(Surface):
     def _number(self) -> float:
         return _number(self.level)
 
-    def jet(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
+    def jet(self, points: Tensor, order: int, piece: Tensor | None = None) -> tuple[Tensor, ...]:
         value, *derivatives = self.field.jet(points, order)
         return value - self.level, *derivatives
 
@@ -88,12 +88,12 @@ class LevelSet(Surface):
         """How many cells of the domain, and pieces in them, may hold the level: their coefficients straddle it."""
         return self.field.relevant(self._number)
 
-    def _first(self, origins: Tensor, directions: Tensor) -> Tensor:
-        return self.field.first_crossing(origins, directions, self._number)
+    def _first(self, origins: Tensor, directions: Tensor) -> Hits:
+        return Hits(self.field.first_crossing(origins, directions, self._number))
 
-    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
+    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
         parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-        return torch.cat([self._sheets_of_part(o, d, sheets, farthest) for o, d in parts])
+        return Hits(torch.cat([self._sheets_of_part(o, d, sheets, farthest) for o, d in parts]))
 
     def _sheets_of_part(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
         found = self.field.crossing_candidates(origins, directions, self._number)

@@ -86,10 +86,13 @@ def mesh(
         the mesh, on the surface's device. Not differentiable.
 
     Raises:
-        TypeError: no surface. ValueError: a step that is no positive number, or of too many grid points.
+        TypeError: no surface, or one in pieces. ValueError: a step that is no positive number, or of too many grid
+            points.
     """
     if not isinstance(surface, Surface):
         raise TypeError(f"surface must be a Surface, such as a LevelSet(field, level); got {type(surface).__name__}")
+    if surface.in_pieces:
+        raise TypeError(f"a mesh is that of one function, as a level set has; got {type(surface).__name__}")
     if outside not in _OUTSIDE:
         raise ValueError(f"outside must be {' or '.join(_OUTSIDE)}; got {outside!r}")
     found = surface.detached

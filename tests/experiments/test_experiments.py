@@ -23,6 +23,7 @@ from experiments.dvr_signal import amplified_difference, displayed, image_errors
 from experiments.registry import EXPERIMENTS, load
 from experiments.runs import read_provenance, read_records
 from experiments.views import View
+from filterlab.io import load_image
 
 VIEW = {
     "size": [24, 16],
@@ -69,6 +70,7 @@ def tiny(name, scan):
         "dvr_volume": {
             "volume": str(scan),
             "methods": ["ncrsi", "triquadratic"],
+            "reference": "triquadratic",
             "view": volume_view,
             "zooms": [{"title": "the middle", "window": [0.25, 0.25, 0.75, 0.75]}],
         },
@@ -421,6 +423,19 @@ def test_a_zoom_is_a_magnified_part(scan):
     assert part.std() > 0.01
 
 
+def test_images_of_a_scan_are_compared_with_those_of_the_reference(ran):
+    folder, records, page = ran("dvr_volume")
+    for view in ("whole", "zoom-1"):
+        other, own = records[f"ncrsi/{view}"], records[f"triquadratic/{view}"]
+        assert "difference" not in own
+        a, b = (load_image(folder / r["image"], srgb=False) for r in (other, own))
+        shown = load_image(folder / other["difference"], srgb=False)
+        assert (shown - (4 * (a - b).abs()).clamp(0, 1)).abs().max() <= 4.6 / 255  # each is rounded to 8 bits
+        assert shown.max() > 0
+        assert 0 < other["rms"] < 1
+    assert "Absolute differences to the image of triquadratic" in page
+
+
 def test_rounded_fractions_cost_more_than_float32(ran):
     _, records, _ = ran("texture_precision")
     for key in ("0/points/triquadratic", "1/points/trilinear+central"):
@@ -553,8 +568,8 @@ def test_a_view_that_cannot_be_drawn_is_refused_before_work(name, change, words,
     else:
         config["view"] = changed
     if name == "dvr_volume" and "size" in change and "step" not in change:
-        assert EXPERIMENTS[name].check(EXPERIMENTS[name].config.model_validate(config), "") is None  # compares nothing
-        return
+        alone = EXPERIMENTS[name].config.model_validate({**config, "reference": None})
+        assert EXPERIMENTS[name].check(alone, "") is None  # compares nothing
     assert_refused(config, words, tmp_path, capsys)
 
 

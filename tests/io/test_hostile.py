@@ -731,6 +731,13 @@ def test_pages_that_share_lists_of_strips(tmp_path: Path) -> None:
     refused(path, "directories or lists of strips that overlap", action=describe)
 
 
+def test_a_list_of_strips_may_be_as_long_as_the_file_holds(tmp_path: Path) -> None:
+    """17 MiB of offsets, and as many counts, of rows of one voxel: true, and refused for being one page only."""
+    path, rows = tmp_path / "a.tif", 17 * 2**18
+    path.write_bytes(tiff_of(1, rows, pages=1, strip=b"?", strips=rows))
+    refused(path, "a stack of two or more pages", "1 (a 2-D image)", action=describe, peak=2**27)
+
+
 def test_strips_that_hold_much_and_are_little(tmp_path: Path) -> None:
     """A strip of a million empty blocks, shared; a tile of 64 MiB for a plane of one voxel, shared."""
     path = tmp_path / "a.tif"
@@ -741,6 +748,52 @@ def test_strips_that_hold_much_and_are_little(tmp_path: Path) -> None:
     tags = {"compression": (259, 3, 1, 8), "wide": (322, 4, 1, 2**12), "high": (323, 4, 1, 2**12)}
     path.write_bytes(tiff_of(1, 1, pages=10_000, strip=tile, **tags))
     refused(path, "pages of", action=describe)
+
+
+# What a byte of deflate data can be at most, and one byte more, claimed of noise that holds far less.
+
+
+@pytest.mark.parametrize("ratio", [1032, 1033])
+def test_gzip_is_told_by_its_header_where_it_cannot_hold_so_much(tmp_path: Path, ratio: int) -> None:
+    noise = os.urandom(1000)
+    path = nrrd_file(tmp_path / "a.nrrd", noise, encoding="gzip", sizes=f"{ratio} {len(noise)} 1")
+    if ratio == 1032:
+        assert describe(path).size == (1032, 1000, 1)
+    else:
+        refused(path, "1000 bytes of gzip data, which cannot hold that many", action=describe)
+
+
+@pytest.mark.parametrize("ratio", [1032, 1033])
+def test_a_strip_is_told_by_its_tags_where_it_cannot_hold_so_much(tmp_path: Path, ratio: int) -> None:
+    path = tmp_path / "a.tif"
+    path.write_bytes(tiff_of(ratio, 1000, strip=os.urandom(1000), compression=(259, 3, 1, 8)))
+    if ratio == 1032:
+        assert describe(path).size == (1032, 1000, 2)
+    else:
+        refused(path, "strips or tiles of 1033000 bytes; got 1000 bytes of deflate data", action=describe)
+
+
+@pytest.mark.parametrize("ratio", [1032, 1033])
+def test_a_member_is_told_by_the_directory_where_it_cannot_hold_so_much(tmp_path: Path, ratio: int) -> None:
+    path = zipped(tmp_path / "a.npz", samples=SMALL)
+    with zipfile.ZipFile(path) as archive:
+        packed = archive.getinfo("samples.npy").compress_size
+    path.write_bytes(path.read_bytes().replace(struct.pack("<I", len(SMALL)), struct.pack("<I", ratio * packed)))
+    refused(path, "24 bytes of samples" if ratio == 1032 else "which cannot hold that many", action=describe)
+
+
+@pytest.mark.parametrize("tag", [270, 282, 305, 65000])
+def test_texts_are_read_no_further_than_they_matter(tmp_path: Path, tag: int) -> None:
+    """17 MiB in one tag: a description of which OME alone wants 4, and tags of which nothing counts."""
+    path, text = tmp_path / "a.tif", bytes(range(33, 127)) * 200_000
+    path.write_bytes(tiff_of(4, 4, more=text[: 17 * 2**20], strip=bytes(range(16)), long=(tag, 2, 17 * 2**20, -1)))
+    assert len(text) > 17 * 2**20
+    tracemalloc.start()
+    found = load_volume(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.samples.flatten().tolist() == 2 * list(range(16))
+    assert peak < 9 * 2**20
 
 
 @pytest.mark.parametrize("element", [b"<a/>", b"<TiffData/>", b"<Channel ID='1'/>", b"<!-- -->", b"&lt;"])

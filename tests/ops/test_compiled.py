@@ -13,6 +13,9 @@ from filterlab.fields.tensor_product import Direct
 from filterlab.kernels import bspline
 from filterlab.ops import Placement, Stencil
 from filterlab.ops.differentiable import operators as compiled
+from filterlab.ops.differentiable.prefilter import prefilter_samples
+from filterlab.ops.prefilter import VOLUME, Filtering
+from filterlab.prefilters import QUADRATIC as QUADRATIC_PREFILTER
 from filterlab.volume import Boundary, Geometry
 from tests.laws import assert_close
 
@@ -73,3 +76,19 @@ def test_a_field_compiles_whole(scheme: str) -> None:
         results.append((value.detach(), *torch.autograd.grad(value, x)))
     for got, want in zip(*results, strict=True):
         assert_close(got, want, 1e-5, float(want.abs().max()))
+
+
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize(("boundary", "tail"), [("mirror", 2), ("border", 3), ("zeros", 1)])
+def test_the_prefilter_as_an_operator(boundary: str, tail: int, implementation: str) -> None:
+    text = compiled.filtering_text("quadratic", boundary, tail)
+    assert compiled.filtering_of(text) == Filtering(VOLUME, QUADRATIC_PREFILTER, Boundary(boundary), tail)
+    own = some(2, 5, 4, 6)
+    opcheck(compiled.prefilter, (own, text, implementation))
+    x = own.detach().clone().requires_grad_()
+    values = compiled.prefilter(x, text, implementation)
+    want = prefilter_samples(x, "quadratic", boundary, tail)
+    assert_close(values.detach(), want.detach(), 1e-14)
+    cotangents = torch.rand_like(values)
+    (found,), (expected,) = (torch.autograd.grad(v, x, cotangents) for v in (values, want))
+    assert_close(found, expected, 1e-13)

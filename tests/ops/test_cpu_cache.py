@@ -369,6 +369,8 @@ from filterlab.ops.cpu import compiler
 from filterlab.ops.march_derivatives import TABLE_ROW
 from filterlab.render import PerspectiveCamera, TransferFunction, render
 
+torch.set_num_threads(1)  # sums of several threads are rounded otherwise
+
 def told():
     # how many programs are compiled when none is in memory, and some derivatives
     made, compile = [], compiler._compile

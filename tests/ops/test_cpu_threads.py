@@ -5,12 +5,14 @@ from __future__ import annotations
 import ctypes
 import os
 import re
+import sys
 import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import filterlab
 from filterlab import forking
@@ -130,6 +132,37 @@ def test_addresses_are_only_taken_where_the_arrays_are_held() -> None:
     taking = re.compile(r"= *\w+(\[\w+\])?\.data_ptr\(\)|ctypes\.data\b|addressof")
     found = {p.name for p in package.rglob("*.py") if taking.search(p.read_text(encoding="utf-8"))}
     assert found <= {"job.py", "threads.py", "prefilter.py"}  # the last one asks how memory is aligned
+
+
+# --- beside torch's own threads ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks Linux what threads do")
+def test_threads_of_torch_do_not_spin_once_there_are_ours() -> None:
+    """Else, whenever two share a core, every loop of torch's takes as long as the one that waits in vain."""
+    threads.aside(int)  # there is one of ours now
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(2, len(os.sched_getaffinity(0))))
+    values, loops = torch.zeros(1 << 16), 20
+    try:
+        values.add_(1)  # torch's threads begin
+        time.sleep(0.05)
+        start = spent_by_others()
+        for _ in range(loops):
+            values.add_(1)
+            time.sleep(0.01)  # in which they sleep, or spin for 3 ms and more
+        assert spent_by_others() - start < loops * 0.001
+    finally:
+        torch.set_num_threads(before)
+
+
+def spent_by_others() -> float:
+    """CPU seconds of all threads but this one."""
+    me, total = threading.get_native_id(), 0
+    for task in Path("/proc/self/task").iterdir():
+        if int(task.name) != me:
+            total += int((task / "schedstat").read_text(encoding="ascii").split()[0])
+    return total * 1e-9
 
 
 # --- what must be left alone ------------------------------------------------------------------------------------------

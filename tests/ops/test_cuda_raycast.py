@@ -126,20 +126,53 @@ def test_a_field_on_a_gpu_is_cast_there(device: str, monkeypatch: pytest.MonkeyP
     assert asked == [3]
 
 
-def test_compiles_for_a_gpu_that_need_not_be_there(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+@pytest.fixture
+def compiling(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     """The interpreter takes what the compiler would refuse; machine code needs no GPU to be made."""
-    from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]
-    from triton.compiler import ASTSource, compile  # pyright: ignore[reportMissingImports]
-
     monkeypatch.setenv("TRITON_INTERPRET", "0")
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
-    lattice = fl.reconstruct(samples(), "trilinear").lattice
-    for asked in ("first", "candidates"):
-        variant = crossings.RaycastVariant(asked, lattice.stencil.lowered, 3, lattice.continuous, "float32")
-        types = dict.fromkeys(("coefficients", "origins", "directions", "pieces"), "*fp32")
-        types |= dict.fromkeys(("numbers", "t", "places"), "*fp64")
-        types |= {"marks": "*i16", "flags": "*u8", "count": "*i64", "BLOCK": "constexpr"}
-        written = launch.launchable(variant.write())
-        source = ASTSource(written, {p.name: types.get(p.name, "i32") for p in written.params}, {"BLOCK": cuda.BLOCK})
-        made = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})
-        assert "bar.sync" not in made.asm["ptx"]  # one warp waits for nobody
+
+
+def program_of(method: str, asked: str):
+    """What Triton compiles, for numbers of 32 bits."""
+    from triton.compiler import ASTSource  # pyright: ignore[reportMissingImports]
+
+    lattice = fl.reconstruct(samples(), method).lattice
+    stencil = lattice.stencil.lowered
+    variant = crossings.RaycastVariant(asked, stencil, lattice.degree, lattice.continuous, "float32")
+    types = dict.fromkeys(("coefficients", "origins", "directions", "pieces"), "*fp32")
+    types |= dict.fromkeys(("numbers", "t", "places"), "*fp64")
+    types |= {"marks": "*i16", "flags": "*u8", "count": "*i64", "BLOCK": "constexpr"}
+    written = launch.launchable(variant.write())
+    return ASTSource(written, {p.name: types.get(p.name, "i32") for p in written.params}, {"BLOCK": cuda.BLOCK})
+
+
+@pytest.mark.parametrize(
+    ("method", "asked", "taps"),
+    [("trilinear", "first", 8), ("trilinear", "candidates", 8), ("qss", "first", 27)],
+)
+def test_compiles_for_a_gpu_that_need_not_be_there(method: str, asked: str, taps: int, compiling: None) -> None:
+    from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]
+    from triton.compiler import compile  # pyright: ignore[reportMissingImports]
+
+    made = compile(program_of(method, asked), target=GPUTarget("cuda", 80, 32), options={"num_warps": 1})
+    lines = made.asm["ptx"].splitlines()
+    assert not [line for line in lines if "bar.sync" in line]  # one warp waits for nobody
+    assert sum("ld.global.b32" in line for line in lines) == 6 + taps  # of a ray, and of a cell or a cube
+
+
+@pytest.mark.parametrize(("method", "asked"), [("cubic-c1", "candidates"), ("quadratic-c1", "first")])
+def test_is_taken_by_the_compilers_front_end(method: str, asked: str, compiling: None) -> None:
+    """That of types and loops: what comes behind it takes 6 to 12 s for these programs."""
+    from triton._C.libtriton import ir  # pyright: ignore[reportMissingImports]
+    from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]
+    from triton.compiler.compiler import make_backend  # pyright: ignore[reportMissingImports]
+
+    target = GPUTarget("cuda", 80, 32)
+    backend, context = make_backend(target), ir.context()
+    ir.load_dialects(context)
+    backend.load_dialects(context)
+    options = backend.parse_options({"num_warps": 1})
+    given = target, options, backend.get_codegen_implementation(options), backend.get_module_map(), context
+    made = str(program_of(method, asked).make_ir(*given))
+    assert made.count("scf.while") == (3 if asked == "candidates" else 5)

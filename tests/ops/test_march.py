@@ -15,7 +15,8 @@ from filterlab.kernels import LINEAR, TensorKernel, bspline
 from filterlab.ops import Stencil, march
 from filterlab.ops.cpu import compiler, frame, mathematics
 from filterlab.ops.cpu.lanes import I64, POINTER, Lanes
-from filterlab.ops.differentiable.march import missing
+from filterlab.ops.differentiable.march import adjoint, missing, run
+from filterlab.ops.reference import march as reference
 
 LANES = {"float32": 8, "float64": 4}
 
@@ -166,3 +167,33 @@ def test_buckets_find_the_interval_that_comparing_finds(spacing: str, dtype: tor
     ends = torch.stack((x[expected], x[expected + 1], alpha[expected], alpha[expected + 1]), -1)
     index = torch.tensor([0, 1, 4, 5]) + beyond[:, None]
     assert torch.equal(row.gather(1, index), ends)
+
+
+# --- segments ---------------------------------------------------------------------------------------------------------
+
+
+def segment_without_length(dtype: torch.dtype = torch.float64) -> march.March:
+    """A ray of three steps, and at its end one more segment, of no length, in what is opaque; 0.25 everywhere else.
+
+    So rounding leaves them: a length of 3 steps over the step may be just above 3.
+    """
+    row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=dtype)
+    x, alpha = torch.tensor([0.5, 1.0], dtype=dtype), torch.tensor([0.25, 1.0], dtype=dtype)
+    table = march.Transfer(x, torch.ones(2, 3, dtype=dtype), alpha, 1.0)
+    entry, along = torch.tensor([[0.0, 0.5, 0.5]]).double(), torch.tensor([[1.0, 0.0, 0.0]]).double()
+    one = torch.ones(1, dtype=torch.float64)
+    chords = march.Chords(entry, along, 3 * one, one, torch.tensor([4]))
+    return march.March(row.expand(2, 2, 4).clone(), 0, Stencil.jet(LINEAR, 0), chords, table, None, 1.0)
+
+
+@pytest.mark.parametrize("dtype", LANES, ids=str)
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+def test_a_segment_without_length_adds_nothing_however_opaque(implementation: str, dtype: str) -> None:
+    given = segment_without_length(getattr(torch, dtype))
+    light, depth = reference.march(given) if implementation == "reference" else run(given, implementation="cpu")
+    tolerance = 100 * torch.finfo(getattr(torch, dtype)).eps
+    assert depth.item() == pytest.approx(-3 * math.log1p(-0.25), rel=tolerance)
+    assert light.tolist() == [pytest.approx([1 - 0.75**3] * 3, rel=tolerance)]
+    cotangents = torch.ones_like(light), torch.ones_like(depth)
+    found = adjoint(given, light, *cotangents, ["coefficients", "rays", "table"], implementation="cpu")
+    assert all(x.isfinite().all() for x in found.values())

@@ -257,9 +257,12 @@ def test_a_zoomed_view_is_a_magnified_crop():
 
 
 @pytest.mark.parametrize("termination", [0.3, 0.05, 1e-3])
-@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 3.0, 0.0)])
-def test_termination_changes_the_image_by_no_more_than_it_says(termination, background):
-    bright = TransferFunction(PEAKS.positions, 1.5 * PEAKS.colors, PEAKS.opacities, unit=0.05)
+@pytest.mark.parametrize(
+    ("glow", "background"), [(1.5, (0.0, 0.0, 0.0)), (1.5, (1.0, 30.0, 0.0)), (0.05, (0.0, 0.0, 0.0))]
+)
+def test_termination_changes_the_image_by_no_more_than_it_says(termination, glow, background):
+    """Of any component: lit colours, what shines through from behind, and opacity."""
+    bright = TransferFunction(PEAKS.positions, glow * PEAKS.colors, PEAKS.opacities, unit=0.05)
     scene = {"size": (24, 18), "shading": LIT, "background": background, "dtype": torch.float64}
     field = Counting(MARSCHNER_LOBB)
     full = render(field, camera_for(field), bright, **scene)
@@ -406,19 +409,22 @@ def test_axis_parallel_face_inside_and_missing_rays():
     assert image[:, 3].tolist() == pytest.approx(expected, abs=1e-14)
 
 
-def test_nan_of_the_field_shows_in_its_pixels_only():
+@pytest.mark.parametrize("order", [0, 1])
+def test_nothing_is_where_a_field_or_the_gradient_that_lights_it_is_nan(order):
     class Torn(Constant):
         def jet(self, points, order):
-            value = torch.where(points[..., 0] > 3, torch.nan, 0.5)
-            return (value.to(points.dtype), torch.ones_like(points))[: order + 1]
+            jet = [torch.full_like(points[..., 0], 0.5), torch.ones_like(points)]
+            jet[torn] = jet[torn] + torch.where(points[..., :1] > 3, torch.nan, 0.0).reshape(*jet[torn].shape[:-1], -1)
+            return tuple(jet[: order + 1])
 
-    camera = OrthographicCamera.framing(BOX, (0, 1, 0))
-    image = render(Torn(), camera, TransferFunction([0.0], GREY, [0.1]), size=(8, 8), shading=LIT)
-    assert image.isnan().any()
-    assert not image.isnan().all(-1).all()
-    origins, _ = camera.rays(8, 8)
-    near, far = intersect(*camera.rays(8, 8), BOX)
-    assert torch.equal(image[..., 3].isnan(), (origins[..., 0] > 3) & (far > near))
+    torn, camera = order, OrthographicCamera.framing(BOX, (0, 1, 0))
+    for clear in (0.0, 0.1):  # values first, and gradients where one is seen; or both in one pass
+        transfer = TransferFunction([0.0, 0.4], GREY * 2, [clear, 0.1])
+        image = render(Torn(), camera, transfer, size=(8, 8), shading=LIT, background=(0.1, 0.2, 0.3))
+        origins, _ = camera.rays(8, 8)
+        near, far = intersect(*camera.rays(8, 8), BOX)
+        assert torch.equal(image[..., 3] > 0, (origins[..., 0] <= 3) & (far > near))
+        assert torch.equal(image[origins[..., 0] > 3], torch.tensor([0.1, 0.2, 0.3, 0.0]).expand(32, 4))
 
 
 def test_mistakes_are_found_before_anything_is_evaluated():

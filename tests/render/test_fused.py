@@ -195,12 +195,15 @@ def test_rays_along_axes_on_faces_from_inside_and_missing() -> None:
         assert (images[0][:, 3] > 0).tolist() == [True, True, True, False, False, True]
 
 
-def test_a_voxel_of_nan_shows_in_the_same_pixels() -> None:
+def test_a_voxel_of_nan_is_transparent_in_the_same_pixels() -> None:
     values = samples()
     values[4, 6, 5] = torch.nan
-    images = both(turned(values), method="catmull-rom", field={"nan": "propagate"}, shading=LIT, size=(20, 18))
+    scene = {"method": "catmull-rom", "shading": LIT, "size": (20, 18)}
+    images = both(turned(values), field={"nan": "propagate"}, **scene)
     assert_same(images)
-    assert 0 < images[0].isnan().any(-1).sum() < 180
+    assert images[0].isfinite().all()
+    clearer = both(turned(values), field={"nan": "fill"}, **scene)[0][..., 3] - images[0][..., 3]
+    assert 0 < (clearer > 1e-3).sum() < 180
 
 
 def test_nothing_behind_the_end_of_a_ray_is_seen() -> None:
@@ -458,6 +461,35 @@ def test_derivatives_at_a_control_point_are_those_to_its_right(monkeypatch: pyte
     for found, expected in zip(*results, strict=True):
         assert expected.abs().max() > 1e-3
         torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
+
+
+CONTROL_POINTS = {
+    "even": [0.0, 0.25, 0.5, 0.75, 1.0],
+    "compared": [-0.5, 0.25, 0.5, 1.0],
+    "bucketed": [k * (k + 1) / 512 for k in range(20)],
+}
+"""Numbers that float32 has, found in each of the ways of `ops.cpu.optics.WAYS`."""
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scheme", ["direct", "fused"])
+@pytest.mark.parametrize("way", CONTROL_POINTS)
+def test_the_slope_at_every_control_point_is_that_to_its_right(way: str, scheme: str, dtype: torch.dtype) -> None:
+    """At the last one it is that to its left. A slice for each: its rays meet that value alone, over 4 voxels."""
+    x = torch.tensor(CONTROL_POINTS[way], dtype=dtype)
+    alpha = torch.rand(len(x), generator=torch.Generator().manual_seed(4), dtype=torch.float64).to(dtype) / 2
+    assert driver._way_to_intervals(march.Transfer(x, x.new_zeros(len(x), 3), alpha, 2.0).steps) == way
+    volume = x[:, None, None].expand(-1, 2, 4).clone().requires_grad_()
+    origins = torch.tensor([[-5.0, 0.5, k] for k in range(len(x))]).double()
+    rays = origins, torch.tensor([[1.0, 0.0, 0.0]]).double().expand_as(origins)
+    transfer = TransferFunction(x, [[1.0, 1.0, 1.0]] * len(x), alpha, 2.0)
+    image = render(reconstruct(volume, "trilinear", scheme=scheme), rays, transfer, step=1.0, dtype=dtype)
+    (found,) = torch.autograd.grad(image[:, 3].sum(), volume)
+    exact = alpha.double()
+    right = exact.diff() / x.double().diff()
+    expected = 2 * (1 - exact) * torch.cat((right, right[-1:]))  # of 1 − (1 − α)²
+    limit = 100 * torch.finfo(dtype).eps * float(expected.abs().max())
+    torch.testing.assert_close(found.sum((1, 2)).double(), expected, rtol=0, atol=limit)
 
 
 def test_derivatives_of_a_single_control_point(monkeypatch: pytest.MonkeyPatch) -> None:

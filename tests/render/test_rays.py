@@ -139,8 +139,10 @@ def test_jitter_is_uniform_uncorrelated_and_a_function_of_seed_and_pixel_only():
         assert abs(r) < 0.025  # 5 σ
     assert torch.equal(jitter(7, torch.tensor([39999, 3])), u[[39999, 3]])
     others = [jitter(seed, torch.arange(40000)) for seed in (8, 7 + 2**32, 7 + 2**62)]
+    others += [jitter(7, torch.arange(40000) + further) for further in (2**32, 2**33, 2**61)]
     for a, b in itertools.combinations([u, *others], 2):
         assert abs(torch.corrcoef(torch.stack((a, b)))[0, 1]) < 0.025
+        assert len(torch.cat((a, b)).unique()) > 80000 - 10  # of 2³² numbers; nor are they the same in another order
     for seed in (-1, 2**63, 1.5, True):
         with pytest.raises(ValueError, match="jitter_seed"):
             jitter(seed, torch.arange(2))  # type: ignore[arg-type]

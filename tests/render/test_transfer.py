@@ -28,15 +28,21 @@ def test_linear_between_exact_at_and_constant_beyond_control_points(dtype):
     assert torch.equal(rgb[-4:], torch.tensor(RGB, dtype=dtype))
 
 
-def test_one_control_point_is_constant_and_nan_stays_nan():
+def test_one_control_point_is_constant_and_a_nan_is_nothing():
     v = torch.tensor([-5.0, 0.5, 9.0, math.nan])
     rgb, alpha = TransferFunction([0.5], [[1.0, 0.5, 0.0]], [0.25])(v)
     assert alpha[:3].tolist() == [0.25] * 3
-    assert alpha[3].isnan()
-    assert rgb[0].tolist() == [1.0, 0.5, 0.0]
-    rgb, alpha = TransferFunction(X, RGB, ALPHA)(v)
-    assert alpha[3].isnan()
-    assert not alpha[:3].isnan().any()
+    assert rgb[:3].tolist() == [[1.0, 0.5, 0.0]] * 3
+    assert (*rgb[3].tolist(), alpha[3].item()) == (0, 0, 0, 0)
+    tables = [torch.tensor(t, dtype=torch.float64, requires_grad=True) for t in (X, RGB, [0.1, 0.3, 0.5, 0.7])]
+    v = v.double().requires_grad_()
+    rgb, alpha = TransferFunction(*tables)(v)
+    assert (*rgb[3].tolist(), alpha[3].item()) == (0, 0, 0, 0)
+    known = TransferFunction(*tables)(v[:3])
+    assert torch.equal(rgb[:3], known[0])
+    assert torch.equal(alpha[:3], known[1])
+    both = [torch.autograd.grad(c.sum() + a.sum(), [*tables, v]) for c, a in ((rgb, alpha), known)]
+    assert all(torch.equal(found, expected) for found, expected in zip(*both, strict=True))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -21,6 +21,7 @@ from torch import Tensor
 from filterlab import forking
 from filterlab.ops.gather import unsupported
 from filterlab.ops.tetrahedra import AnyStencil
+from filterlab.ops.tracing import constant
 
 _COORDINATES = {torch.float32: 1 << 24, torch.float64: 1 << 28}  # exact in the dtype; 8 times it fits 32 bits
 
@@ -53,9 +54,14 @@ def missing(
     return None
 
 
-@lru_cache
+@constant
 def llvmlite_problem() -> str | None:
     """Why no program can be compiled here; None: they can."""
+    return _llvmlite_problem()
+
+
+@lru_cache
+def _llvmlite_problem() -> str | None:
     try:
         with forking.lock:  # what the first call needs, whole
             import filterlab.ops.cpu.evaluation  # noqa: F401

@@ -28,7 +28,7 @@ from filterlab.ops.cpu import threads
 from filterlab.ops.cpu.frame import ENTRY
 from filterlab.ops.cpu.job import Function
 
-SOURCES = ("ops", "bernstein.py", "kernels.py", "prefilters.py", "roots.py", "volume.py", "world.py")
+SOURCES = ("ops", "bernstein.py", "geometry.py", "kernels.py", "prefilters.py", "roots.py", "volume.py", "world.py")
 """Files and folders of filterlab that a program depends on: everything that `ops` imports (a test checks it)."""
 
 _Result = TypeVar("_Result")

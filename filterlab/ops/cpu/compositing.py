@@ -25,7 +25,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from llvmlite import ir
 
@@ -266,6 +266,14 @@ class _Program:
 
     # --- samples ---
 
+    def sampled(self, segments: Segments) -> tuple[Segments, list[Node]]:
+        """Rows of the stencil, and which segments are real: nothing is where one of the rows is NaN."""
+        b, rows = self.builder, self.taps.contract(segments.points, self.job.coefficients)
+        real = segments.real
+        for i in range(0, len(rows), 2):  # one comparison is of two
+            real = b.and_(real, b.fcmp_ordered("ord", rows[i], rows[min(i + 1, len(rows) - 1)]))
+        return replace(segments, real=real), [Node(row) for row in rows]
+
     def world_gradient(self, tape: Tape, gradient: Sequence[Node]) -> list[Node]:
         """Gradients of the grid in the world: Σ_i gradient_i matrix_ij."""
         matrix = [[self._everywhere(self.job.world, I64(3 * i + k)) for k in range(3)] for i in range(3)]
@@ -331,8 +339,7 @@ class _March(_Program):
 
     def _march(self, first: Run, second: Run, same: Value) -> None:
         e, b = self.lanes, self.builder
-        segments = self._segments(first, second)
-        rows = [Node(row) for row in self.taps.contract(segments.points, self.job.coefficients)]
+        segments, rows = self.sampled(self._segments(first, second))
         tape = Tape(e)
         located = self.table.locate(tape, rows[0])
         opacity = self.table.opacity(tape, located)
@@ -433,8 +440,8 @@ class _Adjoint(_Program):
         self.traversal.every_run(self._march)
 
     def _march(self, run: Run) -> None:
-        ray, segments = run.ray, self.traversal.segments(run.ray, run.first)
-        rows = [Node(row) for row in self.taps.contract(segments.points, self.job.coefficients)]
+        ray = run.ray
+        segments, rows = self.sampled(self.traversal.segments(ray, run.first))
         tape = Tape(self.lanes)
         located = self.table.locate(tape, rows[0])
         with self._if_it_counts(located, segments):

@@ -142,6 +142,10 @@ class Lanes:
         product = self.multiply(a, b)
         return product if c is None else self.add(product, c)
 
+    def fused(self, a: Value, b: Value, c: Value) -> Value:
+        """a · b + c with one rounding, whatever the machine has: slow where that is no instruction."""
+        return self._intrinsic(f"llvm.fma.v{self.count}f{self.bits}", self.pack, [a, b, c])
+
     def polynomial(self, coefficients: Sequence[float], u: Value) -> Value:
         """Σ_j coefficients[j] u^j by Horner's rule; NaN where u is NaN, even for a constant."""
         *lower, highest = coefficients
@@ -178,6 +182,10 @@ class Lanes:
     def less(self, a: Value, b: Value) -> Value:
         """A mask: a < b, false where either is NaN."""
         return self.builder.fcmp_ordered("<", a, b)
+
+    def both(self, a: Value, b: Value) -> Value:
+        """A mask: where two masks hold."""
+        return self.builder.and_(a, b)
 
     def differs(self, a: Value, number: float = 0.0) -> Value:
         """A mask: a ≠ number, NaN included."""

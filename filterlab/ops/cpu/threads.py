@@ -18,7 +18,7 @@ import os
 import sys
 from _thread import allocate_lock, start_new_thread
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from queue import SimpleQueue
 from time import perf_counter
 from typing import Any, TypeVar
@@ -146,9 +146,32 @@ class _Threads:
         return True
 
     def _serve(self) -> None:
+        _count_one_more()
         while True:
             self._tasks.get().work()  # no name for it: what is done is not held while waiting
             self._idle.append(None)
+
+
+@cache
+def _count_one_more() -> None:
+    """Let torch's OpenMP know, once, from a thread of ours, that more threads than its own want the cores.
+
+    At the ends of a loop of torch's, threads of libgomp spin for 3 ms before they sleep, for it takes the cores to be
+    theirs. Where two share a core, that one has to wait out the other's spinning at every loop: 143 loops of a render
+    make seconds of a fifth of one. libgomp spins a thousandth as long while it counts more of its threads than there
+    are cores (its manual, GOMP_SPINCOUNT); of ours it knows nothing. So one of them opens a loop of two threads, whose
+    second one sleeps from then on, and is counted.
+
+    Nothing of it is needed where torch uses fewer threads than there are cores: libgomp goes on spinning there.
+    """
+    if sys.platform != "linux":
+        return
+    everything = ctypes.CDLL(None)  # torch loads its OpenMP for all to see
+    try:
+        loop, nothing = everything.GOMP_parallel, everything.omp_get_thread_num
+    except AttributeError:
+        return
+    loop(ctypes.cast(nothing, ctypes.c_void_p), None, 2, 0)
 
 
 _threads = _Threads()

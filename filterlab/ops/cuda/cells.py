@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 
-from filterlab.ops.cuda.source import Source, number
+from filterlab.ops.cuda.source import Source, any_of, number
 from filterlab.ops.cuda.taps import AXES
 from filterlab.ops.pieces import NO_MOTION
 
@@ -34,11 +34,6 @@ def smaller(a: str, b: str) -> str:
 def larger(a: str, b: str) -> str:
     """b where either is NaN."""
     return f"tl.where({a} > {b}, {a}, {b})"
-
-
-def any_of(mask: str) -> str:
-    """Whether it holds for a ray of the warp."""
-    return f"tl.reduce(({mask}).to(tl.int32), 0, either) > 0"
 
 
 class Walk:

@@ -1,23 +1,24 @@
 """The programs that cast rays at a level in Triton: rays in, hits out; or the pieces that may hold one.
 
 The plan is that of `ops.cpu.crossings`, with a warp in place of a pack: every ray walks to its next cell that may hold
-the level (`cells`), the sum over taps is restricted to the ray's part there (`restriction`), and where it changes its
-sign once the ray waits for one root search of the whole warp (`polynomials`).
+the level (`cells`), the sum is restricted to the ray's part there (`restriction`; of splines on tetrahedra to one part
+after the other, `tetrahedral_restriction`), and where it changes its sign once the ray waits for one root search of the
+whole warp (`polynomials`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import comb
 
 from filterlab.ops.cuda import cells
 from filterlab.ops.cuda.cells import Walk, larger, smaller
 from filterlab.ops.cuda.polynomials import TINY, FirstRoot
-from filterlab.ops.cuda.restriction import Restriction
+from filterlab.ops.cuda.restriction import Restriction, Section
 from filterlab.ops.cuda.source import Source, number
 from filterlab.ops.cuda.taps import AXES
+from filterlab.ops.cuda.tetrahedral_restriction import TetrahedralRestriction
 from filterlab.ops.raycast import JUMP, REPEATED, Written
-from filterlab.ops.stencil import Lowered
+from filterlab.ops.tetrahedra import LoweredStencil, TetrahedralStencil
 
 ARRAYS = ("coefficients", *cells.ARRAYS)
 SIZES = ("width", "height", *cells.SIZES, "capacity")
@@ -31,14 +32,14 @@ class RaycastVariant:
 
     Attributes:
         asked: "first" or "candidates".
-        stencil: the sum over taps, one row.
+        stencil: what is summed, one row.
         degree: n, along a ray.
         continuous: whether polynomials of neighbouring cells agree where they meet.
         arithmetic: "float32" or "float64": of rays and polynomials.
     """
 
     asked: str
-    stencil: Lowered
+    stencil: LoweredStencil
     degree: int
     continuous: bool
     arithmetic: str
@@ -61,18 +62,23 @@ class _Program:
         self.source = Source(f"raycast_{variant.asked}", parameters)
         self.line = self.source.line
         self.walk = Walk(self.source)
-        self.restriction = Restriction(self.source, variant.stencil, variant.degree)
+        self.restriction = self._restriction_of(variant.stencil)
         self.search = FirstRoot(self.source, variant.degree, variant.arithmetic)
         self.rows = [f"row_{i}" for i in range(variant.degree + 1)]
 
-    searching = "going"
-    """A mask of rays that have to go on."""
+    waiting = "(ray < 0)"
+    """A mask of rays that need not go on."""
+
+    def _restriction_of(self, stencil: LoweredStencil) -> Restriction | TetrahedralRestriction:
+        if isinstance(stencil, TetrahedralStencil):
+            return TetrahedralRestriction(self.source, stencil)
+        return Restriction(self.source, stencil, self.degree)
 
     def begin(self) -> None:
         """Before the first cell."""
         raise NotImplementedError
 
-    def take(self) -> None:
+    def take(self, section: Section) -> None:
         """Pieces that may hold a hit: those of rays under the mask `holds`."""
         raise NotImplementedError
 
@@ -91,40 +97,46 @@ class _Program:
         line("ended_at = start * 0.0 - 1.0")
         line("before = nothing")
         self.begin()
-        with self.walk.while_any(self.searching):
-            self.walk.next_cells(self.searching)
+        searching = f"going & ~{self.waiting}"
+        with self.walk.while_any(searching):
+            self.walk.next_cells(searching)
             with self.walk.if_any("found"):
-                self._piece()
-                with self.walk.if_any("holds"):
-                    self.take()
+                self._in_cells()
+                with self.restriction.every("row", "found", self.waiting) as section:
+                    self._piece(section)
+                    with self.walk.if_any("holds"):
+                        self.take(section)
         self.end()
         return self.source
 
     # --- pieces ---
 
-    def _piece(self) -> None:
-        """`row_0` …, coefficients of f − level; `jump`, `repeated` and `holds`, masks."""
-        line, rows = self.line, self.rows
+    def _in_cells(self) -> None:
+        """What `Restriction` finds of rays in their cells."""
+        line = self.line
         for end, at in (("u", "near"), ("v", "far")):
             for a in AXES:
                 line(f"{end}_{a} = entry_{a} + {at} * direction_{a} - at_{a}.to(tl.float64)")
                 line(f"{end}_{a} = {smaller(larger(f'{end}_{a}', '0.0'), '1.0')}")
                 line(f"{end}_{a} = {end}_{a}.to(arithmetic)")
         line("first = coefficients + ((at_z * height + at_y) * width + at_x)")
-        self.restriction.restrict("row")
-        for i, row in enumerate(rows):
-            line(f"{row} = {row} * {number(1 / comb(self.degree, i))} * gain + shift")
+
+    def _piece(self, section: Section) -> None:
+        """`row_0` …, coefficients of f − level; `jump`, `repeated` and `holds`, masks."""
+        line, rows = self.line, self.rows
+        for row in rows:
+            line(f"{row} = {row} * gain + shift")
         line(f"whole = tl.abs({' + '.join(rows)}) < infinity")
-        line("joined = found & (near == ended_at) & (tl.abs(before) < infinity)")
-        line("ended_at = tl.where(found, far, ended_at)")
-        self._join()
+        line(f"joined = {section.mask} & ({section.near} == ended_at) & (tl.abs(before) < infinity)")
+        line(f"ended_at = tl.where({section.mask}, {section.far}, ended_at)")
+        self._join(section)
         line(f"smallest, largest = {rows[0]}, {rows[0]}")
         for row in rows[1:]:
             line(f"smallest = {smaller('smallest', row)}")
             line(f"largest = {larger('largest', row)}")
-        line("holds = found & whole & (((smallest <= 0.0) & (largest >= 0.0)) | jump)")
+        line(f"holds = {section.mask} & whole & (((smallest <= 0.0) & (largest >= 0.0)) | jump)")
 
-    def _join(self) -> None:
+    def _join(self, section: Section) -> None:
         """To the piece before: with its last value, or with a jump; `repeated` where it begins on the level again."""
         line, (begin, *_, end) = self.line, self.rows
         if self.variant.continuous:
@@ -133,13 +145,13 @@ class _Program:
         else:
             line(f"jump = joined & (((before < 0.0) & ({begin} > 0.0)) | ((before > 0.0) & ({begin} < 0.0)))")
         line(f"repeated = joined & (before == 0.0) & ({begin} == 0.0)")
-        line(f"before = tl.where(found, {end}, before)")
+        line(f"before = tl.where({section.mask}, {end}, before)")
 
 
 class _First(_Program):
     """Every ray waits at its first hit, and all of a warp are searched together."""
 
-    searching = "going & ~hit"
+    waiting = "hit"
 
     def begin(self) -> None:
         self.search.begin()
@@ -147,7 +159,7 @@ class _First(_Program):
         self.line("at_start, at_end = hit, hit")
         self.line("hit_near, hit_far = s, s")
 
-    def take(self) -> None:
+    def take(self, section: Section) -> None:
         """Keep pieces for the root search, if they have a root."""
         line, rows = self.line, self.rows
         end, tiny = rows[-1], number(TINY[self.variant.arithmetic])
@@ -169,8 +181,8 @@ class _First(_Program):
         line("ends = hard & on_end & ~met")
         line("met = met | ends")
         line("hit, at_start, at_end = hit | met, at_start | begins, at_end | ends")
-        line("hit_near = tl.where(met, near, hit_near)")
-        line("hit_far = tl.where(met, far, hit_far)")
+        line(f"hit_near = tl.where(met, {section.near}, hit_near)")
+        line(f"hit_far = tl.where(met, {section.far}, hit_far)")
 
     def end(self) -> None:
         line = self.line
@@ -193,11 +205,11 @@ class _Candidates(_Program):
         self.line("capacity = capacity.to(tl.int64)")
         self.line("many = ray * 0")
 
-    def take(self) -> None:
+    def take(self, section: Section) -> None:
         line = self.line
         line("room = holds & (many < capacity)")
         line("slot = ray * capacity + many")
-        for k, name in enumerate(("start", "near", "far")):
+        for k, name in enumerate(("start", section.near, section.far)):
             line(f"tl.store(places + 3 * slot + {k}, {name} * scale, room)")
         for i, row in enumerate(self.rows):
             line(f"tl.store(pieces + {len(self.rows)} * slot + {i}, {row}, room)")

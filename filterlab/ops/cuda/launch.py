@@ -39,7 +39,9 @@ def _either(a, b):
 def _launchable(name: str, text: str, interpreted: bool) -> Any:
     file = f"<filterlab {name} {hashlib.sha256(text.encode()).hexdigest()[:16]}>"
     linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
-    namespace: dict[str, Any] = {"tl": tl, "either": triton.jit(_either), "__name__": __name__}
+    # the interpreter calls a function for every number, but for some that it knows
+    either = tl.standard._elementwise_max if interpreted else triton.jit(_either)
+    namespace: dict[str, Any] = {"tl": tl, "either": either, "__name__": __name__}
     exec(compile(text, file, "exec"), namespace)
     function = namespace[name]
     parameters = function.__code__.co_varnames[: function.__code__.co_argcount]

@@ -32,8 +32,8 @@ class OnTable:
 
     @property
     def colored(self) -> str:
-        """Whether the interval has an opacity other than 0 at one of its ends; NaN counts."""
-        return " | ".join(f"({end} != 0.0)" for end in self.ends[2:]) + f" | ({self.fraction} != {self.fraction})"
+        """Whether the interval has an opacity other than 0 at one of its ends."""
+        return " | ".join(f"({end} != 0.0)" for end in self.ends[2:])
 
 
 def locate(tape: Tape, value: Node, active: bool, even: bool) -> OnTable:

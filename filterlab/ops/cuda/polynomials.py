@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from math import comb
 
-from filterlab.ops.cuda.cells import any_of
-from filterlab.ops.cuda.source import Source, number
+from filterlab.ops.cuda.source import Source, any_of, number
 from filterlab.ops.raycast import PASSES, USUAL
 from filterlab.roots import ROUNDINGS
 

@@ -17,7 +17,6 @@ from filterlab.ops.cuda.crossings import ARRAYS, NUMBERS, SIZES, RaycastVariant
 from filterlab.ops.cuda.launch import interpreting, launchable
 from filterlab.ops.cuda.taps import AXES
 from filterlab.ops.gather import in_whole_rows
-from filterlab.ops.pieces import Lattice
 from filterlab.ops.raycast import Candidates, Raycast, Written, written_in_parts
 
 
@@ -46,7 +45,6 @@ def _cast(
     if not len(origins):
         return
     lattice = given.lattice
-    assert isinstance(lattice, Lattice), "splines on tetrahedra are not cast here"
     arithmetic = str(given.dtype).removeprefix("torch.")
     variant = RaycastVariant(asked, lattice.stencil.lowered, lattice.degree, lattice.continuous, arithmetic)
     rays = {"origins": origins.to(given.dtype), "directions": directions.to(given.dtype)}

@@ -7,6 +7,8 @@ large stencils are a loop, as in `ops.cuda.taps`: Triton takes its time for prog
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from math import comb, prod
 
 from filterlab.ops.cuda.source import Source, number
@@ -19,10 +21,26 @@ Polynomial = list[str]
 """Names of scaled Bernstein coefficients."""
 
 
+@dataclass(frozen=True)
+class Section:
+    """Names of a section of a ray's part in a cell.
+
+    Attributes:
+        mask: which rays have one.
+        near, far: where on the ray it begins and ends.
+    """
+
+    mask: str
+    near: str
+    far: str
+
+
 class Restriction:
     """Writes restrictions of a stencil of one row to polynomials of a degree, at the end of a source.
 
-    Names that the source must have: `width` and `height` as 64-bit integers, `arithmetic`, and `nothing`, zeros of it.
+    Names that the source must have: `width` and `height` as 64-bit integers, `arithmetic`, and `nothing`, zeros of it;
+    of rays in cells `near`, `far`, `u_x` … and `v_x` …, where they are there, in [0, 1], and `first`, the address of
+    the cell's first tap.
     """
 
     def __init__(self, source: Source, stencil: Lowered, degree: int) -> None:
@@ -30,11 +48,22 @@ class Restriction:
         self.degrees = [[_degree(table) for table in functions] for functions in stencil.functions]
         self.written_out = prod(stencil.supports) <= WRITTEN_OUT
 
-    def restrict(self, into: str) -> None:
-        """into_0 …: Σ over taps, from u_x, u_y, u_z to v_x, v_y, v_z in [0, 1].
+    @contextmanager
+    def every(self, into: str, mask: str, waiting: str) -> Iterator[Section]:
+        """The with-block, for each of the sections in which a ray's part in a cell is one polynomial: the whole.
 
-        `first` is the address of every ray's first tap.
+        Args:
+            into: Bernstein coefficients are into_0 …
+            mask: which rays are asked for.
+            waiting: a mask of rays that need not go on.
         """
+        self.restrict(into)
+        for j in range(self.degree + 1):
+            self.line(f"{into}_{j} = {into}_{j} * {number(1 / comb(self.degree, j))}")
+        yield Section(mask, "near", "far")
+
+    def restrict(self, into: str) -> None:
+        """into_0 …: Σ over taps, from u_x, u_y, u_z to v_x, v_y, v_z, scaled coefficients."""
         for axis in range(3):
             self._weigh(axis)
         for j in range(self.degree + 1):

@@ -19,7 +19,7 @@ from contextlib import AbstractContextManager
 from typing import Protocol
 
 from filterlab.ops.cuda.optics import Lights, shade
-from filterlab.ops.cuda.source import Source
+from filterlab.ops.cuda.source import Source, any_of
 from filterlab.ops.cuda.sums import Sums, sums_of
 from filterlab.ops.cuda.tape import Node, Tape
 from filterlab.ops.cuda.taps import AXES
@@ -72,8 +72,8 @@ def arrays_of(variant: RayVariant) -> tuple[str, ...]:
 class Program:
     """Writes a program. What is done at its begin, with a segment and at its end are lines of the march or its adjoint.
 
-    Those find `near`, the rays that have a segment here which is not known to be empty; `row_0` …; `thickness`, the
-    segment's length in units of the opacity; and keep `passed`, the optical depth behind it.
+    Those find `near`, the rays that have a segment here which is not known to be empty, and no NaN; `row_0` …;
+    `thickness`, the segment's length in units of the opacity; and keep `passed`, the optical depth behind it.
     """
 
     def __init__(self, name: str, variant: RayVariant) -> None:
@@ -97,7 +97,7 @@ class Program:
     def write(self) -> Source:
         self._begin()
         self.begin()
-        with self.source.block("while tl.reduce(goes.to(tl.int32), 0, either) > 0"):
+        with self.source.block(f"while {any_of('goes')}"):
             self._segment()
             self.taps.locate("coefficients")
             self.line("near = goes")
@@ -106,6 +106,8 @@ class Program:
             with self.if_any("near"):
                 self.taps.weigh()
                 self.taps.contract("first")
+                for r in range(len(self.taps.stencil.rows)):
+                    self.line(f"near = near & (row_{r} == row_{r})  # nothing is at a NaN")
                 self.sample()
             self.line("i += leap" if self.skipping else "i += 1")
             self.line("goes = inside & (i < count) & ((passed <= opaque) | (passed != passed))  # NaN goes on")
@@ -114,7 +116,7 @@ class Program:
 
     def if_any(self, mask: str) -> AbstractContextManager[None]:
         """The with-block, for all rays of the warp, unless the mask holds for none of them."""
-        return self.source.block(f"if tl.reduce(({mask}).to(tl.int32), 0, either) > 0")
+        return self.source.block(f"if {any_of(mask)}")
 
     # --- rays and segments ---
 

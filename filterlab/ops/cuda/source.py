@@ -42,6 +42,11 @@ def number(value: float) -> str:
     return repr(float(value)) if value >= 0 else f"({float(value)!r})"
 
 
+def any_of(mask: str) -> str:
+    """Whether it holds for one of the numbers of a block."""
+    return f"tl.reduce(({mask}).to(tl.int32), 0, either) > 0"
+
+
 def polynomial(coefficients: Sequence[float], u: str) -> str:
     """Σ_j coefficients[j] u^j by Horner's rule; a literal for a constant."""
     *lower, highest = coefficients

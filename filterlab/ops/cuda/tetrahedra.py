@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 from filterlab.ops.cuda.source import Source, number
 from filterlab.ops.cuda.taps import AXES, SIZES, first_taps
-from filterlab.ops.tetrahedra import Steps, Sum, TetrahedralStencil
+from filterlab.ops.tetrahedra import Block, Steps, Sum, TetrahedralStencil, Turned
 
 
 class Text:
@@ -39,6 +39,9 @@ class Text:
     def multiply_add(self, a: str, b: str, c: str | None) -> str:
         return self.named(f"{a} * {b}" if c is None else f"{a} * {b} + {c}")
 
+    def divide(self, a: str, b: str) -> str:
+        return self.named(f"({a}) / {b}")
+
     def negate(self, a: str) -> str:
         return self.named(f"-{a}")
 
@@ -50,6 +53,9 @@ class Text:
 
     def less(self, a: str, b: str) -> str:
         return self.named(f"{a} < {b}")
+
+    def both(self, a: str, b: str) -> str:
+        return self.named(f"{a} & {b}")
 
     def where(self, mask: str, a: str, b: str) -> str:
         return self.named(f"tl.where({mask}, {a}, {b})")
@@ -77,26 +83,49 @@ class TetrahedralTaps:
 
     def weigh(self) -> None:
         """The points in the cone, and where their samples lie."""
-        text, strides = self.text, ("1", "width", "width * height")
         self.turned = self.sum.turn([f"u{axis}" for axis in AXES])
-        signed = [text.where(n, f"-({s})", s) for n, s in zip(self.turned.negative, strides, strict=True)]
-        along = self.sum.along_cone(self.turned, signed)
-        lowest = f"-{self.sum.spline.before} * (1 + width + width * height)"
-        self.corners = [self._corner(lowest, along, centre) for centre in self.sum.spline.centres]
+        along = self.sum.along_cone(self.turned, self._signed_strides(self.turned))
+        self.corners = self._corners([_diagonal(-self.sum.spline.before)], along)
 
-    def _corner(self, lowest: str, along: Sequence[str], centre: Sequence[int]) -> str:
-        """Where a block of samples begins, from the coefficient of the cell's index."""
-        terms = [f"{step} * {axis}" for step, axis in zip(centre, along, strict=True) if step]
-        return self.text.named(" + ".join([lowest, *terms]))
+    def at_sample(self, turned: Turned | None) -> list[str]:
+        """Where blocks of points in the cubes about samples begin, from the first sample that a cube needs.
+
+        Args:
+            turned: the points from the centres of their cells; None of cubes, which need the same samples everywhere.
+        """
+        spline = self.sum.spline
+        first = [_diagonal(spline.around - spline.before)]
+        if turned is None:
+            return first * len(spline.centres)
+        strides = self._signed_strides(turned)  # the sample is ahead of the cell's centre
+        first += [self.text.where(n, "0", f"-({s})") for n, s in zip(turned.negative, strides, strict=True)]
+        return self._corners(first, self.sum.along_cone(turned, strides))
+
+    def _signed_strides(self, turned: Turned) -> list[str]:
+        """Along x, y, z away from the centre."""
+        strides = zip(turned.negative, ("1", "width", "width * height"), strict=True)
+        return [self.text.where(negative, f"-({s})", s) for negative, s in strides]
+
+    def _corners(self, first: Sequence[str], along: Sequence[str]) -> list[str]:
+        """Where blocks of samples begin: Σ first, and the steps to their centres."""
+        return [
+            self.text.named(
+                " + ".join([*first, *(f"{step} * {axis}" for step, axis in zip(centre, along, strict=True) if step)])
+            )
+            for centre in self.sum.spline.centres
+        ]
 
     def contract(self, tap: str, rows: str = "row") -> None:
         """See `Taps.contract`."""
-        blocks = [
-            {at: self.text.named(f"tl.load({place}).to(arithmetic)") for at, place in self._places(tap, corner)}
-            for corner in self.corners
-        ]
-        for r, row in enumerate(self.sum.contract(blocks, self.turned)):
+        for r, row in enumerate(self.sum.contract(self.blocks(tap, self.corners), self.turned)):
             self.source.line(f"{rows}_{r} = {row}")
+
+    def blocks(self, tap: str, corners: Sequence[str]) -> list[Block]:
+        """All that a tetrahedron needs, as it lies in memory."""
+        return [
+            {at: self.text.named(f"tl.load({place}).to(arithmetic)") for at, place in self._places(tap, corner)}
+            for corner in corners
+        ]
 
     def spread(self, tap: str, mask: str, rows: str = "row") -> None:
         """See `Taps.spread`."""
@@ -110,3 +139,8 @@ class TetrahedralTaps:
         """The addresses of a block's samples."""
         for i, j, k in self.sum.places:
             yield (i, j, k), f"{tap} + {corner} + ({i} + {j} * width + {k} * (width * height))"
+
+
+def _diagonal(steps: int) -> str:
+    """So many steps along all three axes."""
+    return f"{steps} * (1 + width + width * height)"

@@ -49,6 +49,10 @@ class Evaluation:
         located, sign = place(points, self.placement, self.implementation)
         return gather(self.coefficients, located, self.stencil, self.start, self.implementation), sign
 
+    def of(self, coefficients: Tensor) -> Evaluation:
+        """The same of other coefficients, on the same device, which lie as these do."""
+        return Evaluation(coefficients, self.placement, self.stencil, self.start, self.implementation)
+
     def _prepare(self, dtype: torch.dtype) -> Evaluator:
         made = driver("cpu", "evaluation").Evaluator(self.coefficients, self.placement, self.stencil, self.start, dtype)
         if made.gather.coefficients.data_ptr() == self.coefficients.data_ptr():  # a copy could become outdated

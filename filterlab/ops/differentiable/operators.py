@@ -1,4 +1,4 @@
-"""gather, scatter and place as operators that torch.compile takes whole.
+"""gather, scatter, place and prefilter as operators that torch.compile takes whole.
 
 torch.compile does not look into an `autograd.Function` with forward mode, so that while it traces, the same operations
 go by these `torch.library` operators. What is no tensor travels as text: operators take nothing else, and a compiled
@@ -8,33 +8,29 @@ graph that is stored on disk must find its stencil again.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict
 from fractions import Fraction
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
+import torch
 from torch import Tensor
 from torch.library import custom_op
 
 from filterlab.kernels import Kernel
 from filterlab.ops.differentiable import gather as sums
 from filterlab.ops.differentiable import place as placement
+from filterlab.ops.differentiable import prefilter as filters
 from filterlab.ops.place import Placement
+from filterlab.ops.prefilter import VOLUME, Filtering
 from filterlab.ops.stencil import Product, Stencil
 from filterlab.ops.tetrahedra import AnyStencil, Tetrahedra, TetrahedralStencil
+from filterlab.ops.tracing import constant
+from filterlab.prefilters import Prefilter, named
 from filterlab.volume import Boundary, Geometry
 
-_Function = TypeVar("_Function", bound=Callable[..., str])
 
-
-def _constant(function: _Function) -> _Function:
-    """As `torch.compiler.assume_constant_result`, which imports torch's compiler: as long as torch itself takes."""
-    function._dynamo_marked_constant = True  # type: ignore[attr-defined]
-    return function
-
-
-@_constant
+@constant
 def stencil_text(stencil: AnyStencil) -> str:
     """The stencil as JSON; `stencil_of` is the inverse."""
     if isinstance(stencil, TetrahedralStencil):
@@ -69,7 +65,7 @@ def _tuples(value: Any) -> Any:
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
-@_constant
+@constant
 def placement_text(placement: Placement) -> str:
     """The placement as JSON; `placement_of` is the inverse."""
     g = placement.geometry
@@ -81,6 +77,20 @@ def placement_of(text: str) -> Placement:
     matrix, origin, boundary, size, tail, shift = json.loads(text)
     geometry = Geometry(tuple(map(tuple, matrix)), tuple(origin))
     return Placement(geometry, Boundary(boundary), tuple(size), tail, shift)
+
+
+@constant
+def filtering_text(prefilter: str | Prefilter, boundary: str | Boundary, tail: int) -> str:
+    """A prefilter along x, y and z as JSON; `filtering_of` is the inverse."""
+    own = named(prefilter)
+    return json.dumps([own.name, [[str(c) for c in f] for f in own.factors], Boundary.named(boundary), tail])
+
+
+@lru_cache(maxsize=1024)
+def filtering_of(text: str) -> Filtering:
+    name, factors, boundary, tail = json.loads(text)
+    own = Prefilter(name, tuple(tuple(Fraction(c) for c in factor) for factor in factors))
+    return Filtering(VOLUME, own, Boundary(boundary), tail)
 
 
 # --- gather -----------------------------------------------------------------------------------------------------------
@@ -187,3 +197,58 @@ def _place_backward(ctx, to_located: Tensor, to_sign: Tensor):
 
 
 place.register_autograd(_place_backward, setup_context=_keep_place)
+
+
+# --- prefilter --------------------------------------------------------------------------------------------------------
+
+
+@custom_op("filterlab::prefilter", mutates_args=())
+def prefilter(samples: Tensor, how: str, implementation: str) -> Tensor:
+    """`ops.prefilter_samples` of a filter given as text."""
+    return _own(filters.evaluate(samples, filtering_of(how), implementation), samples)
+
+
+@prefilter.register_fake
+def _(samples: Tensor, how: str, implementation: str) -> Tensor:
+    *batch, d, h, w = samples.shape
+    beyond, dtype = 2 * filtering_of(how).tail, torch.promote_types(samples.dtype, torch.float32)
+    return samples.new_empty((*batch, d + beyond, h + beyond, w + beyond), dtype=dtype)
+
+
+def _keep_prefilter(ctx, inputs, output) -> None:
+    samples, *ctx.rest = inputs
+    ctx.shape, ctx.dtype = samples.shape, samples.dtype
+
+
+def _prefilter_backward(ctx, cotangents: Tensor):
+    return prefilter_adjoint(cotangents.contiguous(), list(ctx.shape), *ctx.rest).to(ctx.dtype), None, None
+
+
+prefilter.register_autograd(_prefilter_backward, setup_context=_keep_prefilter)
+
+
+@custom_op("filterlab::prefilter_adjoint", mutates_args=())
+def prefilter_adjoint(cotangents: Tensor, shape: list[int], how: str, implementation: str) -> Tensor:
+    """The adjoint of `prefilter`, back to the shape of the samples."""
+    return _own(filters.adjoint(cotangents, torch.Size(shape), filtering_of(how), implementation), cotangents)
+
+
+@prefilter_adjoint.register_fake
+def _(cotangents: Tensor, shape: list[int], how: str, implementation: str) -> Tensor:
+    return cotangents.new_empty(shape)
+
+
+def _keep_adjoint(ctx, inputs, output) -> None:
+    _, _, *ctx.rest = inputs
+
+
+def _adjoint_backward(ctx, incoming: Tensor):
+    return prefilter(incoming.contiguous(), *ctx.rest), None, None, None
+
+
+prefilter_adjoint.register_autograd(_adjoint_backward, setup_context=_keep_adjoint)
+
+
+def _own(result: Tensor, given: Tensor) -> Tensor:
+    """The result in memory of its own: an operator may not return what it was given."""
+    return result.clone() if result.data_ptr() == given.data_ptr() else result.contiguous()

@@ -61,7 +61,7 @@ def missing(samples: Tensor, implementation: str) -> str | None:
 def implementation_for(samples: Tensor) -> str:
     """The fastest implementation for these samples: the fused one of their device where it can run, or "reference"."""
     fused = FUSED.get(samples.device.type)
-    if fused is None or torch.compiler.is_compiling() or missing(samples, fused):
+    if fused is None or missing(samples, fused):
         return "reference"
     return fused
 
@@ -136,6 +136,16 @@ def _prefiltered(samples: Tensor, how: Filtering, implementation: str) -> Tensor
     if why := missing(samples, implementation):
         raise ValueError(f"implementation {implementation!r} can't run here: {why}; implementation='reference' can")
     return reference.filter_axes(samples, how) if how.prefilter.is_identity else _fused(samples, how, implementation)
+
+
+def evaluate(samples: Tensor, how: Filtering, implementation: str) -> Tensor:
+    """Coefficients, without derivatives."""
+    return _prefiltered(samples.detach(), how, implementation)
+
+
+def adjoint(cotangents: Tensor, shape: torch.Size, how: Filtering, implementation: str) -> Tensor:
+    """Its adjoint, without derivatives."""
+    return _adjoint(cotangents.detach(), shape, how, implementation)
 
 
 class _Prefilter(torch.autograd.Function):

@@ -9,7 +9,7 @@ from filterlab.ops import cpu, cuda
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.raycast import Candidates, Raycast
-from filterlab.ops.tetrahedra import AnyLattice, TetrahedralLattice
+from filterlab.ops.tetrahedra import AnyLattice
 
 
 def missing(given: Raycast, origins: Tensor) -> str | None:
@@ -26,10 +26,7 @@ def missing_for(lattice: AnyLattice, dtype: torch.dtype, origins: Tensor) -> str
     if transforming():
         return "it has no transforms of torch.func"
     points = torch.empty(1, 0, 3, dtype=dtype, device=origins.device)
-    on_a_gpu = _implementation_for(lattice) == "cuda"
-    if on_a_gpu and isinstance(lattice, TetrahedralLattice):
-        return "on a GPU it casts sums over taps"
-    room = cuda if on_a_gpu else cpu
+    room = cuda if _implementation_for(lattice) == "cuda" else cpu
     return room.missing(lattice.coefficients.detach()[None, None], points, lattice.stencil)
 
 

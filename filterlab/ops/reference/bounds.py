@@ -59,16 +59,12 @@ def layers_of(lattice: AnyLattice, edge: int) -> Iterator[tuple[Tensor, Tensor]]
 
 
 def _layers_of_cubes(lattice: TetrahedralLattice, edge: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """The same of a spline on tetrahedra: no value is farther from the middle of its samples than the norm allows."""
-    values, (_, _, size), (x, y, depth) = lattice.coefficients.detach(), lattice.supports, lattice.cells
-    on_a_gpu = values.device.type != "cpu"
-    step = max(_NUMBERS_AT_ONCE // (x * y), 1) * _AT_ONCE if on_a_gpu else _AT_ONCE
-    for first in range(0, depth, step):
-        cells = min(step, depth - first)
+    """The same of a spline on tetrahedra."""
+    values, (_, _, size), (_, _, depth) = lattice.coefficients.detach(), lattice.supports, lattice.cells
+    for first in range(0, depth, _AT_ONCE):
+        cells = min(_AT_ONCE, depth - first)
         slab = lattice.scale * values.narrow(0, first, cells + size - 1).double() + lattice.shift
-        low, high = tetrahedra.ranges_of_cubes(slab, lattice.spline)
-        middle, half = (low + high) / 2, (high - low) / 2 * lattice.spline.norm
-        low, high = middle - half, middle + half
+        low, high = tetrahedra.hulls_of_cubes(slab, lattice.spline)
         for dim in range(3):
             low, high = over_windows(torch.amin, low, dim, edge, 0), over_windows(torch.amax, high, dim, edge, 0)
         yield low, high

@@ -193,8 +193,14 @@ def _goes_on(samples: Samples, count: Tensor, depth: Tensor, first: int) -> Tens
     return (count > first) & ~((transmittance < samples.faint) | (transmittance == 0))  # NaN goes on
 
 
-def _block(samples: Samples, chords: Chords, depth: Tensor, first: int) -> tuple[Tensor, Tensor]:
-    """What K segments of every ray add to its light `(R, 3)`, and its optical depth behind them `(R,)`."""
+def _block(
+    samples: Samples, chords: Chords, depth: Tensor, first: int, in_one_pass: bool = False
+) -> tuple[Tensor, Tensor]:
+    """What K segments of every ray add to its light `(R, 3)`, and its optical depth behind them `(R,)`.
+
+    Args:
+        in_one_pass: gradients come with values, whatever else is known.
+    """
     dtype, transfer, count = samples.dtype, samples.transfer, chords.count
     middle, thickness = segments(chords.length, samples.step, first, BLOCK, chords.offset)
     real = torch.arange(first, first + BLOCK, device=count.device) < count[:, None]  # (R, K)
@@ -207,8 +213,13 @@ def _block(samples: Samples, chords: Chords, depth: Tensor, first: int) -> tuple
 
     # gradients come in one pass with values when nearly every sample needs one: when derivatives are asked, or when no
     # value is transparent
-    one_pass = samples.lit and (samples.differentiable or not transfer.transparent_somewhere)
+    one_pass = samples.lit and (samples.differentiable or in_one_pass or not transfer.transparent_somewhere)
     jet = samples.jet(points, 1 if one_pass else 0)
+    if (known := _known(jet)) is not None:  # nothing is where a value is NaN
+        kept = known if kept is None else kept[known]
+        points, thickness = points[known], thickness[known]
+        # 0 · NaN is NaN: what is not there must not be in the graph either
+        jet = samples.jet(points, len(jet) - 1) if samples.differentiable else tuple(_pick(x, known) for x in jet)
     located = transfer.locate(jet[0])
     tau = transfer.optical_depth(transfer.opacity(located), thickness)
     weight, after = _compose(_spread(tau, kept, real.shape), depth, samples.faint)
@@ -219,10 +230,18 @@ def _block(samples: Samples, chords: Chords, depth: Tensor, first: int) -> tuple
     color = transfer.color(located if seen is None else located.at(seen))
     if samples.lit:
         gradient = _pick(jet[1], seen) if one_pass else _gradient(samples, _pick(points, seen))
+        if not one_pass and _known((gradient,)) is not None:  # others are seen, too, where such a one is not there
+            return _block(samples, chords, depth, first, in_one_pass=True)
         ray = (torch.arange(real.numel(), device=count.device) if place is None else place) // BLOCK
         color = samples.shade(color, gradient, ray, direction.index_select(0, ray))
     emitted = _pick(weight, seen)[:, None] * color
     return _sum_pairwise(_spread(emitted, place, real.shape)).double(), after
+
+
+def _known(jet: Sequence[Tensor]) -> Tensor | None:
+    """Which of S samples are no NaN, in any of `(S, *)`; None: all of them."""
+    unknown = torch.stack([x.detach().isnan().reshape(len(x), -1).any(-1) for x in jet]).any(0)
+    return (~unknown).nonzero()[:, 0] if bool(unknown.any()) else None
 
 
 def _gradient(samples: Samples, points: Tensor) -> Tensor:

@@ -5,13 +5,13 @@ Letters as in `ops.reference.gather`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 
 import torch
 from torch import Tensor
 
-from filterlab.ops.tetrahedra import Block, Sum, Tetrahedra, TetrahedralStencil
+from filterlab.ops.tetrahedra import Block, Rows, Steps, Sum, Tetrahedra, TetrahedralStencil, at_centre
 
 
 class Tensors:
@@ -35,6 +35,9 @@ class Tensors:
     def multiply_add(self, a: Tensor, b: Tensor, c: Tensor | None) -> Tensor:
         return a * b if c is None else torch.addcmul(c, a, b)
 
+    def divide(self, a: Tensor, b: Tensor) -> Tensor:
+        return a / b
+
     def negate(self, a: Tensor) -> Tensor:
         return -a
 
@@ -46,6 +49,9 @@ class Tensors:
 
     def less(self, a: Tensor, b: Tensor) -> Tensor:
         return a < b
+
+    def both(self, a: Tensor, b: Tensor) -> Tensor:
+        return a & b
 
     def where(self, mask: Tensor, a: Tensor, b: Tensor) -> Tensor:
         return torch.where(mask, a, b)
@@ -108,15 +114,67 @@ def spread(out: Tensor, cotangents: Tensor, at: Reads, offset: Tensor | int) -> 
 
 # --- bounds -----------------------------------------------------------------------------------------------------------
 
+_NUMBERS_AT_ONCE = 1 << 20
+"""Coefficients of as many layers of cubes, or of one: they stay in cache."""
 
-def ranges_of_cubes(samples: Tensor, spline: Tetrahedra) -> tuple[Tensor, Tensor]:
-    """(least, greatest) sample that the tetrahedra of every cube about a sample need, NaN where one is.
+
+def hulls_of_cubes(samples: Tensor, spline: Tetrahedra) -> tuple[Tensor, Tensor]:
+    """(least, greatest) Bernstein coefficient of every cube about a sample, NaN where a sample is not finite.
 
     Args:
         samples: (D, H, W), also those that the outermost cubes need; cubes are counted from an even index on.
     """
-    low, high = -largest_of_windows(-samples, spline.size), largest_of_windows(samples, spline.size)
-    return (-_largest_of_blocks(-low), _largest_of_blocks(high)) if spline.octahedral else (low, high)
+    low, high = (samples.new_empty([n - 2 * spline.around for n in samples.shape]) for _ in range(2))
+    parts = _where_octahedra_meet(samples, spline) if spline.octahedral else _windows(samples, spline)
+    for place, inputs, masks in parts:
+        weights, shape = samples.new_tensor(masks), inputs[0].shape
+        layers = max(1, _NUMBERS_AT_ONCE // max(1, len(masks) * shape[1] * shape[2]))
+        found = [
+            (weights @ torch.stack(own).flatten(1)).aminmax(dim=0)
+            for own in zip(*(x.split(layers) for x in inputs), strict=True)
+        ]
+        for out, columns in zip((low, high), zip(*found, strict=True), strict=True):
+            out[place] = torch.cat(columns).reshape(shape)
+    return low, high
+
+
+_Inputs = tuple[tuple[slice, ...], list[Tensor], Sequence[Sequence[float]]]
+"""Of some cubes: which, the numbers that their coefficients are made of, and the masks of these."""
+
+
+def _windows(samples: Tensor, spline: Tetrahedra) -> Iterator[_Inputs]:
+    """All cubes: the samples around each."""
+    whole = [n - 2 * spline.around for n in samples.shape]
+    places = product(range(spline.size), repeat=3)
+    yield (slice(None),) * 3, [_from(samples, (z, y, x), whole, 1) for x, y, z in places], spline.masks_of_cube
+
+
+def _where_octahedra_meet(samples: Tensor, spline: Tetrahedra) -> Iterator[_Inputs]:
+    """Cubes of even and odd indices along each axis: what blocks tell of their centres, turned round along odd axes."""
+    whole = [n - 1 for n in samples.shape]
+    block = {(x, y, z): _from(samples, (z, y, x), whole, 1) for x, y, z in product(range(2), repeat=3)}
+    rows = at_centre(Tensors(samples), block)
+    terms = [{(centre, unit): weight for centre, unit, weight in mask} for mask in spline.masks_of_octahedra]
+    keys = sorted(set().union(*terms))
+    masks = [[mask.get(key, 0.0) for key in keys] for mask in terms]
+    for parity in product((0, 1), repeat=3):
+        every_second = tuple(slice(p, None, 2) for p in parity)
+        count = [len(range(p, n - 4, 2)) for p, n in zip(parity, samples.shape, strict=True)]
+        if 0 not in count:
+            yield every_second, [_turned_row(rows, parity, count, *key) for key in keys], masks
+
+
+def _turned_row(rows: Rows, parity: Sequence[int], count: Sequence[int], centre: Steps, unit: Steps) -> Tensor:
+    """Of every second cube along z, y, x: eight times a value, or four times a derivative, at twice a centre."""
+    sides = [1 - 2 * p for p in parity]
+    first = [2 + p + (side * c - 1) // 2 for p, side, c in zip(parity, sides, reversed(centre), strict=True)]
+    row = _from(rows[unit], first, count, 2)
+    return -row if any(side < 0 and u for side, u in zip(sides, reversed(unit), strict=True)) else row
+
+
+def _from(values: Tensor, first: Sequence[int], count: Sequence[int], step: int) -> Tensor:
+    """As many numbers from a place on along every axis, so many steps apart."""
+    return values[tuple(slice(a, a + step * (n - 1) + 1, step) for a, n in zip(first, count, strict=True))]
 
 
 def largest_of_windows(values: Tensor, size: int) -> Tensor:
@@ -124,33 +182,3 @@ def largest_of_windows(values: Tensor, size: int) -> Tensor:
     for dim in range(3):
         values = values.unfold(dim, size, 1).amax(-1)
     return values
-
-
-def _largest_of_blocks(blocks: Tensor) -> Tensor:
-    """Of the eight blocks of 2³ that a cube's two octahedra need: about their centres, and two steps beyond each.
-
-    The centres stand at sample ± σ / 2, σ = 1 along axes of even, −1 along those of odd indices.
-    """
-    out = blocks.new_empty([n - 3 for n in blocks.shape])
-    for parity in product((0, 1), repeat=3):
-        every_second = tuple(slice(p, None, 2) for p in parity)
-        count = out[every_second].shape
-        if 0 not in count:
-            parts = [_block(blocks, parity, count, centre) for centre in _centres(parity)]
-            out[every_second] = torch.stack(parts).amax(0)
-    return out
-
-
-def _centres(parity: Sequence[int]) -> list[tuple[int, ...]]:
-    """Twice the centres of a cube's blocks, from its sample."""
-    centres: list[tuple[int, ...]] = []
-    for side in (1, -1):
-        own = tuple(side * (1 - 2 * p) for p in parity)
-        centres += [own, *(tuple(c - 4 * c * (i == axis) for i, c in enumerate(own)) for axis in range(3))]
-    return centres
-
-
-def _block(blocks: Tensor, parity: Sequence[int], count: Sequence[int], centre: Sequence[int]) -> Tensor:
-    """Of every second cube along each axis, the block at that centre."""
-    first = (2 + p + (c - 1) // 2 for p, c in zip(parity, centre, strict=True))
-    return blocks[tuple(slice(a, a + 2 * n - 1, 2) for a, n in zip(first, count, strict=True))]

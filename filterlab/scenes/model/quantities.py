@@ -9,7 +9,8 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BeforeValidator, Field
 
-from filterlab.io.config import StrictModel, unknown_name
+from filterlab.io.config import StrictModel
+from filterlab.names import unknown_name
 
 
 class Section(StrictModel):

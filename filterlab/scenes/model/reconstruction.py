@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from filterlab.fields.base import Field as FilterlabField
 from filterlab.fields.storage import StorageName
 from filterlab.methods import METHODS, Method, reconstruct, scheme_named
-from filterlab.missing_values import NanChoice
+from filterlab.names import NanChoice
 from filterlab.scenes.model.quantities import Names, Section, Told, named, part
 from filterlab.volume import Boundary, Volume
 

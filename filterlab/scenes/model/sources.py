@@ -13,8 +13,8 @@ from pydantic import AfterValidator, Field, ValidationInfo, field_validator, mod
 
 from filterlab import signals
 from filterlab.io.bounded import VolumeFileError
-from filterlab.io.config import unknown_name
 from filterlab.io.volumes import VolumeHeader, describe, load_volume
+from filterlab.names import unknown_name
 from filterlab.scenes.model.quantities import LISTED, Names, Section, Told, named
 from filterlab.volume import Volume
 

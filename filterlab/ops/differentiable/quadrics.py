@@ -1,0 +1,40 @@
+"""Casting rays at quadrics: what runs it. Derivatives of hits are `surfaces.base`'s, once for all surfaces."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from filterlab.ops import cpu
+from filterlab.ops.differentiable.drivers import driver
+from filterlab.ops.differentiable.recording import transforming
+from filterlab.ops.quadrics import Quadrics
+
+
+def missing(given: Quadrics, origins: Tensor) -> str | None:
+    """What keeps the program from running here; None: nothing does."""
+    if transforming():
+        return "it has no transforms of torch.func"
+    if problem := cpu.llvmlite_problem():
+        return problem
+    if given.leaves.device.type != "cpu" or origins.device.type != "cpu":
+        return f"it works on tensors of the CPU; got {given.leaves.device} and {origins.device}"
+    return None
+
+
+def hits(
+    given: Quadrics,
+    origins: Tensor,
+    directions: Tensor,
+    sheets: int,
+    farthest: bool = False,
+    implementation: str | None = None,
+) -> tuple[Tensor, Tensor]:
+    """t (R, k) float64 of the first hits of rays (R, 3), or the last ones, and which quadrics they hit (R, k) int64.
+
+    Args:
+        sheets, farthest: k hits in order, or from the last on; t is ∞, the number −1 where there are no more.
+        implementation: "reference" or "cpu"; None: the faster one that can run.
+    """
+    if implementation is None:
+        implementation = "cpu" if missing(given, origins) is None else "reference"
+    return driver(implementation, "quadrics").hits(given, origins, directions, sheets, farthest)

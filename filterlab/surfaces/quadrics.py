@@ -1,0 +1,276 @@
+"""Quadrics: many surfaces of second order, each where its bounds are, hit exactly along rays.
+
+Every one is a function of its own, F(x) = y·A y + 2 b·y + c with y = x − o from an origin o, and a piece of the
+surface: hits tell which. F > 0 is outside. Rays are solved from near what they hit, by root formulas in which nothing
+cancels (`ops.quadrics`, `ops.reference.quadrics`), in float64 whatever the type of the rays.
+
+| case | what is a hit |
+|---|---|
+| F = 0 within the bounds, edges included | one hit, a front where F goes from + to − along the ray, else a back |
+| a ray touches, meets the apex of a cone or a double plane | one hit, a front, if within the rounding of α, β, γ |
+| a ray lies on the surface | one hit, a front, where it enters the bounds |
+| A = 0, or the ray is parallel to an asymptote | the one root that is left |
+| a ray begins inside, or on the surface | as any other; t = 0 where F(o) = 0 within rounding |
+| two quadrics at one place | two hits; the first is any of them |
+| the gradient is 0 there, as at an apex | a hit with normal 0 and no derivatives |
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from filterlab.fields.base import Domain
+from filterlab.ops import quadrics as described
+from filterlab.ops.differentiable import quadrics as ops
+from filterlab.surfaces import quadric_kinds as kinds
+from filterlab.surfaces.base import Hits, Surface
+from filterlab.surfaces.bounds import Bounds, check_rows
+
+_ROUNDINGS = 16  # of the largest coordinate, by which bounds are larger: neighbours that share a face leave no gap
+_SEEN = 1e-12  # of the terms of a test, by which it has to fail
+_MARGIN = 1e-4  # of the diagonal, around all: rays begin outside of what they hit
+_FINEST = 1e-3  # of the diagonal: as the smallest radius counts what is smaller
+
+
+class Quadrics(Surface):
+    """Surfaces y·A y + 2 b·y + c = 0, y = x − o, each within its bounds.
+
+    Args:
+        A: (M, 3, 3), float32 or float64; of another one than a symmetric matrix the symmetric part counts.
+        b: (M, 3). c: (M,). Differentiable, as A is.
+        bounds: `Spheres(centers, radii)`, `Tetrahedra(corners)` or `Planes(halfspaces)`, of as many.
+        origins: o (M, 3), in the world; None: its origin. Coefficients about a point nearby keep digits that those far
+            away have lost. Differentiable.
+        cuts: (M, K, 4) or (M, 4): n, d of more halfspaces n·x + d ≤ 0 that are kept, as at sharp edges.
+        faces: which hits count: "front", from F > 0 to F < 0 along the ray, "back", or "both".
+
+    Memory: 124 bytes of working data and 40 of the index for each, and 32 for each plane. The index is built at the
+    first hit, and again when numbers were changed in place.
+
+    Raises:
+        TypeError, ValueError: no such tensors, or of other lengths or devices; numbers that are not finite; A and b
+            that are both 0, of which nothing is a surface.
+    """
+
+    max_order = 2
+    in_pieces = True
+
+    def __init__(
+        self,
+        A: Tensor,
+        b: Tensor,
+        c: Tensor,
+        bounds: Bounds,
+        origins: Tensor | None = None,
+        *,
+        cuts: Tensor | None = None,
+        faces: str = "both",
+    ) -> None:
+        if not isinstance(bounds, Bounds):
+            raise TypeError(f"bounds must be Spheres, Tetrahedra or Planes; got {type(bounds).__name__}")
+        if faces not in described.FACES:
+            raise ValueError(f"faces must be one of {', '.join(described.FACES)}; got {faces!r}")
+        count = len(bounds)
+        self.A, self.b = check_rows("A", A, (count, 3, 3)), check_rows("b", b, (count, 3))
+        self.c = check_rows("c", c, (count,))
+        self.origins = b.new_zeros(count, 3) if origins is None else check_rows("origins", origins, (count, 3))
+        self.bounds, self.faces = bounds if cuts is None else bounds.cut(cuts), faces
+        self._check()
+        self.domain = _domain(self.bounds)
+        self._built: tuple[tuple[int, ...], described.Quadrics] | None = None
+
+    def _check(self) -> None:
+        if not len(self):
+            raise ValueError("quadrics must be at least one; got none")
+        places = {x.device for x in (*self.tensors, self.bounds.centers)}
+        if len(places) > 1:
+            raise ValueError(f"quadrics and their bounds must be on one device; got {', '.join(map(str, places))}")
+        nothing = (self.A.detach() == 0).flatten(1).all(1) & (self.b.detach() == 0).all(1)
+        if n := int(nothing.sum()):
+            raise ValueError(f"A and b must not both be 0, or F is constant; of {n} of {len(self)} quadrics they are")
+
+    def __len__(self) -> int:
+        return len(self.bounds)
+
+    def __repr__(self) -> str:
+        return f"Quadrics({self.bounds!r}, faces={self.faces!r})"
+
+    # --- kinds ---
+
+    @classmethod
+    def ellipsoids(cls, centers: Tensor, semi_axes: Tensor, *, faces: str = "both") -> Quadrics:
+        """Ellipsoids {x = p + L u, |u| = 1}: F = |L⁻¹ (x − p)|² − 1.
+
+        Args:
+            centers: p (M, 3), in the world.
+            semi_axes: (M,) radii of balls, (M, 3) half lengths along x, y, z, or L (M, 3, 3), whose columns are half
+                axes, or anything that maps the unit ball: √D of a diffusion tensor D. World units.
+            faces: as of `Quadrics`.
+
+        Differentiable in both. Raises TypeError, ValueError: no such tensors; a semi-axis that is not positive; an L
+        that flattens space.
+        """
+        return cls(*kinds.ellipsoids(centers, semi_axes), faces=faces)
+
+    @classmethod
+    def cylinders(
+        cls, starts: Tensor, ends: Tensor, radii: Tensor, *, caps: bool = False, faces: str = "both"
+    ) -> Quadrics:
+        """Round tubes between two points: F = |P y|² / ρ² − 1, y from the middle, P y its part across the axis.
+
+        Args:
+            starts, ends: (M, 3) middles of both ends, in the world.
+            radii: ρ (M,), in world units.
+            caps: whether ends are closed by discs: pieces M … 2 M − 1 at the starts, 2 M … 3 M − 1 at the ends.
+            faces: as of `Quadrics`.
+
+        Differentiable in all three; where a tube ends has none. Raises TypeError, ValueError: no such tensors; a radius
+        that is not positive; a start that is the end.
+        """
+        parts = [kinds.cylinders(starts, ends, radii)]
+        parts += [kinds.discs(starts, starts - ends, radii), kinds.discs(ends, ends - starts, radii)] if caps else []
+        return cls(*kinds.joined(parts), faces=faces)
+
+    @classmethod
+    def cones(
+        cls, apexes: Tensor, bases: Tensor, radii: Tensor, *, caps: bool = False, faces: str = "both"
+    ) -> Quadrics:
+        """Round cones: F = |P y|² / ρ² − (a·y / h)², y from the apex, a the unit axis, h the height.
+
+        Args:
+            apexes, bases: (M, 3), the tips and the middles of the circles they widen to, in the world.
+            radii: ρ (M,) of the circles, in world units.
+            caps: whether circles are closed by discs: pieces M … 2 M − 1.
+            faces: as of `Quadrics`.
+
+        Differentiable and raises as `cylinders`.
+        """
+        parts = [kinds.cones(apexes, bases, radii)]
+        parts += [kinds.discs(bases, bases - apexes, radii)] if caps else []
+        return cls(*kinds.joined(parts), faces=faces)
+
+    @classmethod
+    def paraboloids(
+        cls, apexes: Tensor, bases: Tensor, radii: Tensor, *, caps: bool = False, faces: str = "both"
+    ) -> Quadrics:
+        """Round paraboloids: F = |P y|² / ρ² − a·y / h; arguments as of `cones`."""
+        parts = [kinds.paraboloids(apexes, bases, radii)]
+        parts += [kinds.discs(bases, bases - apexes, radii)] if caps else []
+        return cls(*kinds.joined(parts), faces=faces)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Quadrics]) -> Quadrics:
+        """All in one surface; pieces are numbered one part after the other. Raises ValueError: faces that differ."""
+        faces = {part.faces for part in parts}
+        if len(faces) != 1:
+            raise ValueError(
+                f"quadrics that are joined must show the same faces; got {', '.join(sorted(faces)) or None}"
+            )
+        given = [kinds.Kind(part.A, part.b, part.c, part.bounds, part.origins) for part in parts]
+        return cls(*kinds.joined(given), faces=faces.pop())
+
+    # --- what a surface is ---
+
+    def jet(self, points: Tensor, order: int, piece: Tensor | None = None) -> tuple[Tensor, ...]:
+        """F, 2 (A y + b) and 2 A of the quadrics numbered by `piece` (...)."""
+        if piece is None:
+            raise ValueError("each quadric has a function of its own; expected which one as piece, got None")
+        A, b, c, origin = (x[piece].double() for x in self.tensors)
+        A, y = (A + A.mT) / 2, points.double() - origin
+        turned = (A * y[..., None, :]).sum(-1)
+        derivatives = (y * (turned + 2 * b)).sum(-1) + c, 2 * (turned + b), 2 * A
+        return tuple(x.to(points.dtype) for x in derivatives[: order + 1])
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        return self.A, self.b, self.c, self.origins
+
+    def with_tensors(self, tensors: Sequence[Tensor]) -> Quadrics:
+        other = copy.copy(self)
+        other.A, other.b, other.c, other.origins = tensors
+        other._built = None
+        return other
+
+    @property
+    def device(self) -> torch.device:
+        return self.bounds.centers.device
+
+    @property
+    def detached(self) -> Quadrics:
+        other = self.with_tensors([x.detach() for x in self.tensors])
+        other._built = tuple(x._version for x in other.tensors), self._cast
+        return other
+
+    def _first(self, origins: Tensor, directions: Tensor) -> Hits:
+        t, piece = ops.hits(self._cast, origins.reshape(-1, 3), directions.reshape(-1, 3), 1)
+        return Hits(t[:, 0], piece[:, 0])
+
+    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
+        return Hits(*ops.hits(self._cast, origins, directions, sheets, farthest))
+
+    # --- what is cast ---
+
+    @property
+    def _cast(self) -> described.Quadrics:
+        """The index and the numbers in it, as they are now."""
+        versions = tuple(x._version for x in self.tensors)
+        if self._built is None or self._built[0] != versions:
+            self._built = versions, self._described()
+        return self._built[1]
+
+    def _described(self) -> described.Quadrics:
+        bounds, (lower, upper) = self.bounds, self.bounds.boxes.around()
+        slack = _ROUNDINGS * torch.finfo(torch.float64).eps * torch.maximum(lower.abs(), upper.abs()).amax()
+        planes = bounds.planes.clone()
+        planes[..., 3] += (planes[..., :3] * bounds.centers[:, None]).sum(-1) - slack
+        return described.Quadrics.of(
+            bounds.boxes, self._about_centers(), bounds.centers, bounds.radii + slack, planes, self.faces
+        )
+
+    def _about_centers(self) -> tuple[Tensor, Tensor, Tensor]:
+        """A, b, c in float64, about the centres of the bounds."""
+        A, b, c, origin = (x.detach().double() for x in self.tensors)
+        A, y = (A + A.mT) / 2, self.bounds.centers - origin
+        turned = (A * y[:, None]).sum(-1)
+        return A, b + turned, c + (y * (turned + 2 * b)).sum(-1)
+
+    def seen_from(self, eye: Tensor) -> Quadrics:
+        """The same without those that cannot show a face that counts to a world point (3,); numbers stay.
+
+        A point y of a surface, from the eye, faces away from it if c' < −b'·y, with c' = F(eye), b' = b + A eye. Where
+        that holds in all of a ball or a tetrahedron the quadric is left out; the tests are exact for them. With faces
+        "both" nothing is left out.
+        """
+        if self.faces == "both":
+            return self
+        found = self._cast.some(self._facing(eye.detach().to(self.bounds.centers)))
+        other = copy.copy(self)
+        other._built = tuple(x._version for x in self.tensors), found
+        return other
+
+    def _facing(self, eye: Tensor) -> Tensor:
+        """(M,) whether some point of the bounds may face it."""
+        sign = 1 if self.faces == "front" else -1
+        A, b, c = (sign * x for x in self._about_centers())
+        e = eye - self.bounds.centers
+        polar = b + (A * e[:, None]).sum(-1)
+        own = (b * e).sum(-1)
+        reach = self.bounds.radii * polar.norm(dim=-1)
+        if self.bounds.corners is not None:
+            corners = self.bounds.corners - self.bounds.centers[:, None]
+            reach = torch.minimum(reach, (corners * polar[:, None]).sum(-1).amax(1))
+        size = c.abs() + own.abs() + reach.abs()
+        return c + own + reach >= -_SEEN * size
+
+
+def _domain(bounds: Bounds) -> Domain:
+    """A box around all, with room; the smallest radius stands for a voxel."""
+    lower, upper = (x.cpu() for x in bounds.boxes.around())
+    diagonal = float((upper - lower).norm())
+    lower, upper = lower - _MARGIN * diagonal, upper + _MARGIN * diagonal
+    finest = max(float(bounds.radii.min()), _FINEST * diagonal)
+    return Domain(tuple(lower.tolist()), tuple(upper.tolist()), voxel_size=finest)
