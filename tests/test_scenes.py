@@ -256,6 +256,39 @@ def test_there_are_example_scenes():
     assert {p.stem for p in SCENES.glob("*.yaml")} >= {"engine", "marschner_lobb", "head_mri"}
 
 
+@pytest.mark.parametrize(
+    ("bare", "key", "value", "full"),
+    [
+        ("method: notch", "method.boundary", "wrap", "method: {name: notch, boundary: wrap}"),
+        ("slice: x", "slice.colormap", "magma", "slice: {axis: x, colormap: magma}"),
+        ("mip: true", "mip.colormap", "magma", "mip: {colormap: magma}"),
+        ("mip: true\nlegend: true", "legend.label", "HU", "mip: true\nlegend: {label: HU}"),
+        ("surface: 0.5", "surface.sheets", "2", "surface: {level: 0.5, sheets: 2}"),
+        (
+            "surface: {level: 0.5, material: toon}",
+            "surface.material.bands",
+            "4",
+            "surface: {level: 0.5, material: {kind: toon, bands: 4}}",
+        ),
+        (
+            "signal: sphere\nmip: true",
+            "signal.parameters",
+            "{radius: 0.4}",
+            "signal: {name: sphere, parameters: {radius: 0.4}}\nmip: true",
+        ),
+    ],
+)
+def test_a_section_that_a_bare_value_stands_for_can_be_changed_in_part(scene_file, bare, key, value, full):
+    """`--slice x --slice.colormap magma`, whether the bare value stands in the file or before it on the line."""
+    base = "" if "signal" in bare else "signal: {name: sphere, samples: 6}\n"
+    base += MINIMAL[MINIMAL.index("transfer") :] if bare.startswith("method") else ""
+    expected = load_scene(scene_file(base + full))
+    assert load_scene(scene_file(base + bare), {key: value}) == expected
+    name, _, first = bare.splitlines()[-1 if "legend" in bare else 0].partition(": ")
+    rest = "\n".join(line for line in bare.splitlines() if not line.startswith(name))
+    assert load_scene(scene_file(base + rest), {name: first, key: value}) == expected
+
+
 # --- surfaces ---------------------------------------------------------------------------------------------------------
 
 SURFACE = """

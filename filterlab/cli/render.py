@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from filterlab.cli.loading import reading
+from filterlab.cli.loading import Progress, reading
 from filterlab.cli.options import Quiet, check_asked
 from filterlab.cli.saving import OutputFile
 from filterlab.cli.scenes import scene_asked_for
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from filterlab.scenes.build import AnyPrepared
+    from filterlab.scenes.model import Scene
 
 
 @dataclass(frozen=True)
@@ -56,45 +58,50 @@ class Render:
     def run(self, overrides: dict[str, str]) -> None:
         check_asked(self.output, self.explain, ".png")
         output = None if self.output is None else self._output(self.output)
-
-        from filterlab.scenes.build import build
-        from filterlab.scenes.turntable import check_turn, turntable
-
         scene = scene_asked_for(self.scene, overrides, self.output)
         if self.turntable is not None:
+            from filterlab.scenes.turntable import check_turn
+
             check_turn(scene, self.turntable)
-        with progress_bar(self.quiet) as progress, reading(progress):
-            prepared = build(scene)
-        views = [prepared] if self.turntable is None else turntable(prepared, self.turntable)
-        if output is not None:
-            self._write(views, output)
+        if output is None:
+            self._explain(scene)
             return
+        with progress_bar(self.quiet) as progress, reading(progress):
+            pictures = _Pictures(self._views(scene), progress)
+            self._write(pictures, output.path)
+        output.tell(pictures.told)
+
+    def _views(self, scene: Scene) -> list[AnyPrepared]:
+        from filterlab.scenes.build import build
+        from filterlab.scenes.turntable import turntable
+
+        prepared = build(scene)
+        return [prepared] if self.turntable is None else turntable(prepared, self.turntable)
+
+    def _explain(self, scene: Scene) -> None:
         from filterlab.scenes.plan import plan
         from filterlab.scenes.plan_report import table
 
+        views = self._views(scene)
         show(table(plan(views[0]), pictures=len(views)))
 
-    def _write(self, views: list[AnyPrepared], output: OutputFile) -> None:
+    def _write(self, pictures: _Pictures, output: Path) -> None:
         from filterlab.io.atomic import atomic_folder
         from filterlab.io.images import save_animation, save_image
         from filterlab.scenes.turntable import seconds_of_each
 
-        with progress_bar(self.quiet) as report:
-            pictures = _pictures(views, report)
-            if self.turntable is None:
-                save_image(next(pictures), output.path)
-            elif output.path.suffix:
-                save_animation(pictures, output.path, seconds=seconds_of_each(len(views)))
-            else:
-                with atomic_folder(output.path) as folder:
-                    for k, picture in enumerate(pictures):
-                        save_image(picture, folder / f"{k:0{max(3, len(str(len(views) - 1)))}d}.png")
-        width, height = views[0].scene.size
-        many = "" if self.turntable is None else f"{len(views)} pictures of "
-        output.tell(f"{many}{width} × {height} pixels, 8-bit RGB")
+        count = len(pictures.views)
+        if self.turntable is None:
+            save_image(next(iter(pictures)), output)
+        elif output.suffix:
+            save_animation(pictures, output, seconds=seconds_of_each(count))
+        else:
+            with atomic_folder(output) as folder:
+                for k, picture in enumerate(pictures):
+                    save_image(picture, folder / f"{k:0{max(3, len(str(count - 1)))}d}.png")
 
     def _output(self, output: Path) -> OutputFile:
-        from filterlab.io.images import ANIMATIONS, PICTURES, format_of
+        from filterlab.io.picture_formats import ANIMATIONS, PICTURES, format_of
 
         if self.turntable is not None and not output.suffix:
             return OutputFile.folder(output, self.scene, quiet=self.quiet)
@@ -102,10 +109,28 @@ class Render:
         return OutputFile.at(output, self.scene, quiet=self.quiet)
 
 
-def _pictures(views: list[AnyPrepared], report: Callable[[float, str], None]) -> Iterator[Tensor]:
-    """The pictures of all views, one after the other."""
-    from filterlab.scenes.build import picture
+@dataclass
+class _Pictures:
+    """The pictures of all views, one after the other; progress is told of.
 
-    for k, view in enumerate(views):
-        what = "rendering" if len(views) == 1 else f"rendering {k + 1} of {len(views)}"
-        yield picture(view, lambda done, total, k=k, what=what: report((k + done / max(total, 1)) / len(views), what))
+    Attributes:
+        told: what was made, when it is.
+    """
+
+    views: list[AnyPrepared]
+    progress: Progress
+    told: str = ""
+
+    def __iter__(self) -> Iterator[Tensor]:
+        from filterlab.scenes.build import picture
+
+        count = len(self.views)
+        for k, view in enumerate(self.views):
+            what = "rendering" if count == 1 else f"rendering {k + 1} of {count}"
+            image = picture(view, partial(self._part, k, what))
+            many = "" if count == 1 else f"{count} pictures of "
+            self.told = f"{many}{image.shape[1]} × {image.shape[0]} pixels, 8-bit RGB"
+            yield image
+
+    def _part(self, k: int, what: str, done: int, total: int) -> None:
+        self.progress((k + done / max(total, 1)) / len(self.views), what)

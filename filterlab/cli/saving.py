@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,6 +32,14 @@ class OutputFile:
     quiet: bool
 
     @classmethod
+    def folder(cls, path: Path, *sources: Path | None, quiet: bool = False) -> OutputFile:
+        """A folder of files that is new, or empty; raises as `at` does."""
+        from filterlab.io.atomic import check_new_folder
+
+        check_new_folder(path)
+        return cls._apart(path, sources, False, quiet)
+
+    @classmethod
     def at(cls, path: Path, *sources: Path | None, quiet: bool = False) -> OutputFile:
         """The file, once it is known that it can be written and is none of the sources.
 
@@ -40,26 +48,15 @@ class OutputFile:
         """
         from filterlab.io.atomic import check_writable
 
-        began = time.perf_counter()
         check_writable(path)
+        return cls._apart(path, sources, path.exists(), quiet)
+
+    @classmethod
+    def _apart(cls, path: Path, sources: Sequence[Path | None], replaces: bool, quiet: bool) -> OutputFile:
         for source in sources:
             if source is not None:
                 check_not_input(path, source)
-        return cls(path, path.exists(), began, quiet)
-
-    @classmethod
-    def folder(cls, path: Path, *sources: Path, quiet: bool = False) -> OutputFile:
-        """A folder of several files, once it is known that it is new, or empty, and can be made.
-
-        Raises OSError as `check_new_folder`.
-        """
-        from filterlab.io.atomic import check_new_folder
-
-        began = time.perf_counter()
-        check_new_folder(path)
-        for source in sources:
-            check_not_input(path, source)
-        return cls(path, False, began, quiet)
+        return cls(path, replaces, time.perf_counter(), quiet)
 
     def tell(self, what: str) -> None:
         """Says in one line that it stands, what is in it, and how long that took."""

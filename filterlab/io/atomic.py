@@ -23,6 +23,10 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
     _check_place(path)
     if path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: expected a file name; got a folder")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise PermissionError(
+            f"cannot write {path}: expected a file that may be replaced; got one that is write-protected"
+        )
     return path
 
 
@@ -50,10 +54,6 @@ def _check_place(path: Path) -> None:
         raise NotADirectoryError(f"cannot write {path}: expected a folder; got {folder}, which is a file")
     if not os.access(folder, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
         raise PermissionError(f"cannot write {path}: expected a writable folder; got {folder}, which is not")
-    if path.exists() and not os.access(path, os.W_OK):
-        raise PermissionError(
-            f"cannot write {path}: expected a file that may be replaced; got one that is write-protected"
-        )
 
 
 @contextmanager

@@ -351,11 +351,16 @@ def _override(document: _Document, model: type[BaseModel], key: str, text: str) 
 
 
 def _unfolded(model: type[BaseModel], path: KeyPath, value: Any) -> Any:
-    """A section that stands as a bare name, with its key (`bare` of its model), so that another key can be set."""
-    if isinstance(value, str):
-        for owner in _types_at(model, path):
-            if _is_model(owner) and hasattr(owner, "bare"):
-                return {owner.bare: value}  # type: ignore[attr-defined]
+    """A section that stands as a bare value, with its key (`bare` of its model), so that another key can be set.
+
+    An empty `bare` stands for a section that `true` stands for, with every default.
+    """
+    for owner in _types_at(model, path):
+        bare = getattr(owner, "bare", None) if _is_model(owner) else None
+        if bare == "" and value is True:
+            return {}
+        if bare and isinstance(value, str | int | float) and not isinstance(value, bool):
+            return {bare: value}
     return value
 
 

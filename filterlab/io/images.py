@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -12,6 +11,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from filterlab.io.atomic import atomic_write
+from filterlab.io.picture_formats import ANIMATIONS, format_of
 
 
 def to_srgb(linear: Tensor) -> Tensor:
@@ -32,21 +32,7 @@ def from_srgb(encoded: Tensor) -> Tensor:
 JPEG_QUALITY = 95
 """Of libjpeg, without subsampling of colours: thin coloured structures stay sharp. Photographs get by with less."""
 
-PICTURES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
-"""Endings of pictures, and their formats."""
-
-ANIMATIONS = {".gif": "GIF", ".png": "PNG"}
-"""Endings of pictures that move, and their formats."""
-
 _SAVED = {"PNG": {}, "JPEG": {"quality": JPEG_QUALITY, "subsampling": 0}}
-
-
-def format_of(path: str | os.PathLike[str], known: Mapping[str, str] = PICTURES) -> str:
-    """The format by a name's ending. Raises ValueError that lists the known ones."""
-    ending = Path(path).suffix.lower()
-    if ending not in known:
-        raise ValueError(f"expected a file name that ends in {' or '.join(known)}; got {path}")
-    return known[ending]
 
 
 def save_image(

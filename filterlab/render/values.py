@@ -26,9 +26,9 @@ from filterlab.render.image import (
     Canvas,
     PixelRays,
     Progress,
-    RayTensors,
+    View,
+    as_view,
     check_background,
-    check_camera,
     check_field,
     device_of,
     reporting,
@@ -50,7 +50,7 @@ _ALONG = 1e-3  # sine of the angle to a normal that lies along what is up
 
 def maximum_projection(
     field: Field,
-    camera: Camera | RayTensors,
+    camera: View,
     *,
     size: Sequence[int] | None = None,
     step: float = 0.5,
@@ -268,7 +268,7 @@ _NORMALS = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 def plane_values(
     field: Field,
     plane: Plane,
-    camera: Camera | RayTensors,
+    camera: View,
     *,
     size: Sequence[int] | None = None,
     region: Region | None = None,
@@ -329,8 +329,8 @@ def _within(points: Tensor, lower: Sequence[float], upper: Sequence[float]) -> T
 # --- both -------------------------------------------------------------------------------------------------------------
 
 
-def _seen(camera: Camera | RayTensors, size: Sequence[int] | None, device: torch.device | str | None) -> PixelRays:
-    check_camera(camera)
+def _seen(camera: View, size: Sequence[int] | None, device: torch.device | str | None) -> PixelRays:
+    camera = as_view(camera)
     return PixelRays.of(camera, size, torch.device(device or device_of(camera) or "cpu"))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from filterlab.io.atomic import atomic_write, check_writable, disk_is_full, remove_temporaries
+from filterlab.io.atomic import atomic_folder, atomic_write, check_writable, disk_is_full, remove_temporaries
 
 
 def test_writes_and_leaves_nothing_else(tmp_path: Path) -> None:
@@ -101,3 +101,17 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) ->
     remove_temporaries(tmp_path, older=60)
     assert sorted(os.listdir(tmp_path)) == [".tmp-0123456789abcdefg", ".tmp-mine", "a.tmp-0123456789abcdef"]
     remove_temporaries(tmp_path / "missing")
+
+
+def test_a_folder_appears_whole_and_what_a_killed_writer_left_of_one_is_removed(tmp_path: Path) -> None:
+    with atomic_folder(tmp_path / "frames") as folder:
+        (folder / "a.png").write_bytes(b"a")
+        assert not (tmp_path / "frames").exists()
+    assert [p.name for p in tmp_path.rglob("*")] == ["frames", "a.png"]
+    left = tmp_path / ".tmp-0123456789abcdef"
+    left.mkdir()
+    (left / "000.png").touch()
+    remove_temporaries(tmp_path)
+    assert not left.exists()
+    with pytest.raises(FileExistsError, match="one with files in it"), atomic_folder(tmp_path / "frames"):
+        pytest.fail("nothing may be written")

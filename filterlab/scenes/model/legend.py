@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from pydantic import model_validator
-
 from filterlab.render.legend import Side
-from filterlab.scenes.model.quantities import Section
+from filterlab.scenes.model.quantities import Switched
 
 
-class LegendModel(Section):
+class LegendModel(Switched):
     """A bar of the colours and their values beside the picture, which it makes larger; `true` stands for all defaults.
 
     Along the bar stands how opaque the values of a medium are: the square root of their part of the largest opacity.
@@ -22,8 +18,3 @@ class LegendModel(Section):
     """Where it is."""
     label: str = ""
     """Of the values: what they are, and their unit."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_true(cls, value: Any) -> Any:
-        return {} if value is True else value

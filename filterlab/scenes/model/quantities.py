@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from filterlab.io.config import StrictModel
 from filterlab.names import unknown_name
@@ -16,11 +16,24 @@ from filterlab.names import unknown_name
 class Section(StrictModel):
     """A section of a scene file. The text under each key, and the examples, become the reference.
 
+    A section that a bare value may stand for says in a class variable `bare` for which key that is.
+
     Attributes:
         examples: sections as people write them, in YAML; together they have every key.
     """
 
     examples: ClassVar[tuple[str, ...]] = ()
+
+
+class Switched(Section):
+    """A section that `true` stands for, with every default."""
+
+    bare: ClassVar[str] = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_true(cls, value: Any) -> Any:
+        return {} if value is True else value
 
 
 @dataclass(frozen=True)
@@ -66,7 +79,7 @@ def part(value: Any) -> Any:
     return float(number) / 100
 
 
-def named(value: Any, key: str = "name") -> Any:
+def named(value: Any, key: str) -> Any:
     """A bare text stands for the section with that key and every default."""
     return {key: value} if isinstance(value, str) else value
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -21,6 +21,8 @@ MethodName = Annotated[str, AfterValidator(Names("method", lambda: METHODS))]
 
 class Reconstruction(Section):
     """How samples become a field; a bare name stands for a method as it is. See `filterlab.reconstruct`."""
+
+    bare: ClassVar[str] = "name"
 
     name: MethodName
     """Of a method."""
@@ -42,7 +44,7 @@ class Reconstruction(Section):
     def _from_name(cls, value: Any) -> Any:
         if isinstance(value, Mapping) and "method" in value:
             raise ValueError("the key method is called name here: write {name: " + f"{value['method']}, …" + "}")
-        return named(value)
+        return named(value, cls.bare)
 
     @model_validator(mode="after")
     def _offered(self) -> Self:

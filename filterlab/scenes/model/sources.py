@@ -41,7 +41,7 @@ class VolumeFile(Section):
     @model_validator(mode="before")
     @classmethod
     def _from_path(cls, value: Any) -> Any:
-        return {cls.bare: value} if isinstance(value, str) else value
+        return named(value, cls.bare)
 
     def path(self, folder: Path = Path()) -> Path:
         """The file, absolute. Raises ValueError if there is none; the message lists where it was looked for."""
@@ -103,6 +103,8 @@ def _packaged(package: str, inside: str) -> Path:
 class SignalModel(Section):
     """A closed-form signal; a bare name stands for its default parameters."""
 
+    bare: ClassVar[str] = "name"
+
     name: Annotated[str, AfterValidator(Names("signal", lambda: signals.SIGNALS))]
     """Of a signal."""
     parameters: Annotated[Parameters, Field(default_factory=dict), Told("numbers, or [x, y, z], by name")]
@@ -111,7 +113,7 @@ class SignalModel(Section):
     @model_validator(mode="before")
     @classmethod
     def _from_name(cls, value: Any) -> Any:
-        return named(value)
+        return named(value, cls.bare)
 
     @field_validator("parameters")
     @classmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
@@ -16,6 +16,8 @@ from filterlab.scenes.model.sources import find_volume, folder_of
 
 class OfSheets(Section):
     """What every material of a surface has."""
+
+    bare: ClassVar[str] = "kind"
 
     opacity: Opacity = 1.0
     """Of one sheet; below 1 those behind show through (`sheets`)."""
@@ -149,6 +151,7 @@ class SurfaceModel(Section):
     """The level set of a scene's field, hit exactly; a bare number stands for its level."""
 
     examples = ("90", "{level: 0.35, axis: normalized, material: toon, sheets: 1, shadows: true, subpixels: 2}")
+    bare: ClassVar[str] = "level"
 
     level: Annotated[float, Told(unit="of the volume's values, or parts of their range: `axis`")]
     """The value on the surface."""
@@ -166,7 +169,7 @@ class SurfaceModel(Section):
     @model_validator(mode="before")
     @classmethod
     def _from_level(cls, value: Any) -> Any:
-        return {"level": value} if isinstance(value, int | float) and not isinstance(value, bool) else value
+        return {cls.bare: value} if isinstance(value, int | float) and not isinstance(value, bool) else value
 
     def at(self, value_range: Callable[[], tuple[float, float]]) -> float:
         """The level as a value of the field. `value_range` is asked where the axis is normalized."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import model_validator
 
 from filterlab.fields.base import Domain
 from filterlab.render.colormaps import GRAY, ColorScale
 from filterlab.render.values import Plane
-from filterlab.scenes.model.quantities import Positive, Section, Told, Vector, named
+from filterlab.scenes.model.quantities import Positive, Section, Switched, Told, Vector, named
 from filterlab.scenes.model.transfer import ColormapName
 
 
@@ -43,18 +43,13 @@ class ValueColors(Section):
         return ColorScale(self.center - self.width / 2, self.center + self.width / 2, self.colormap)
 
 
-class MipModel(ValueColors):
+class MipModel(Switched, ValueColors):
     """The largest value along every ray (maximum intensity projection); `true` stands for all defaults.
 
     With a `transfer` it has that one's colours, and no window.
     """
 
     examples = ("true", "{center: 400, width: 900, colormap: bone}")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_true(cls, value: Any) -> Any:
-        return {} if value is True else value
 
 
 class SliceModel(ValueColors):
@@ -69,6 +64,7 @@ class SliceModel(ValueColors):
         "{axis: z, position: 31.5, center: 40, width: 400, colormap: gray}",
         "{point: [64, 64, 32], normal: [1, 1, 1]}",
     )
+    bare: ClassVar[str] = "axis"
 
     axis: Literal["x", "y", "z"] | None = None
     """The world axis that the plane lies across."""
@@ -82,7 +78,7 @@ class SliceModel(ValueColors):
     @model_validator(mode="before")
     @classmethod
     def _from_axis(cls, value: Any) -> Any:
-        return named(value, "axis")
+        return named(value, cls.bare)
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
