@@ -11,7 +11,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
 from filterlab.fields.base import Domain
 
 Region = tuple[Sequence[float], Sequence[float]]
@@ -20,14 +19,13 @@ Region = tuple[Sequence[float], Sequence[float]]
 _NO_MOTION = 1e-30
 
 
-def check_rays(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
+def check_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """Origins and unit directions in float64, `(..., 3)` each; differentiable.
 
     Raises:
-        TypeError: not two real tensors or arrays.
+        TypeError: not two real tensors.
         ValueError: shapes that are not equal and (..., 3); a number that is not finite; a zero direction.
     """
-    origins, directions = as_tensor(origins), as_tensor(directions)
     for name, x in (("origins", origins), ("directions", directions)):
         if not isinstance(x, Tensor) or not x.dtype.is_floating_point:
             found = getattr(x, "dtype", type(x).__name__)
