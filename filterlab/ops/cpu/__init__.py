@@ -4,10 +4,11 @@
                                                                 │
     tensors ──▶ job ────────────────────────────threads─────────┴──▶ result
 
-`gather`, `place`, `prefilter`, `march`, `raycast` and `bounds` describe arrays to programs as jobs and run them;
-`points`, `folding`, `recursion`, `compositing`, `crossings` and `hulls` write those programs, from the sums of `taps`
-(read it first, its head explains how they are computed) and the single instructions of `lanes`. `compiler` and `cache`
-make and keep machine code, `threads` runs it. What is here can be asked without llvmlite: whether they can run at all.
+`gather`, `place`, `prefilter`, `contract`, `march`, `raycast` and `bounds` describe arrays to programs as jobs and run
+them; `points`, `folding`, `recursion`, `contraction`, `compositing`, `crossings` and `hulls` write those programs, from
+the sums of `taps` (read it first, its head explains how they are computed) and the single instructions of `lanes`.
+`compiler` and `cache` make and keep machine code, `threads` runs it. What is here can be asked without llvmlite:
+whether they can run at all.
 """
 
 from __future__ import annotations
