@@ -7,7 +7,9 @@ The nearest sample is taken as it stands, in its own type.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,15 +18,16 @@ from torch import Tensor
 
 from filterlab import prefilters
 from filterlab.fields.base import Field
-from filterlab.kernels import PiecewisePolynomial
+from filterlab.kernels import PiecewisePolynomial, bspline
 from filterlab.labels import strongest
-from filterlab.methods import METHODS, Method, TensorProduct, checked, reconstruct
+from filterlab.methods import METHODS, Method, TensorProduct, Tetrahedral, checked, reconstruct
 from filterlab.missing_values import resolved
-from filterlab.ops.contract import Axes, Contraction
+from filterlab.ops.contract import Axes, Contraction, Rows
 from filterlab.ops.differentiable.contract import contract, fused
 from filterlab.ops.differentiable.recording import plain
 from filterlab.ops.gather import STORAGE
-from filterlab.resampling_rows import reached, rows_of
+from filterlab.resampling_rows import Given, reached, rows_of
+from filterlab.shrinking import projected, smoothing
 from filterlab.sites import NEARER, Part, Sites
 from filterlab.volume import Boundary, Geometry, Volume, as_volume, exact_float
 
@@ -34,6 +37,11 @@ if TYPE_CHECKING:
 Progress = Callable[[float], None]
 PARTS = 16  # in which a result is made that needs more than one number a voxel
 SMALLEST = 1 << 16  # voxels of one
+UNTOLD = 1.25  # voxels of the old grid that a step may have before a warning
+
+
+class AliasingWarning(UserWarning):
+    """A grid is coarser than that of the samples, and nothing is said of what it does not hold."""
 
 
 def resample(
@@ -50,6 +58,7 @@ def resample(
     nan: str = "refuse",
     labels: bool = False,
     fill: float | None = None,
+    antialias: bool | None = None,
     progress: Progress | None = None,
 ) -> Volume:
     """The volume reconstructed by a method and sampled on another grid.
@@ -71,11 +80,17 @@ def resample(
             in the memory of one. Not differentiable.
         fill: the value of new voxels whose centres lie outside of the old box of voxels, which ends half a voxel beyond
             the outermost centres; NaN too. Default: none, the boundary rules there.
+        antialias: on a coarser grid, the values of the cubic spline of that grid which is nearest to the reconstruction
+            in L², so that frequencies it does not hold are left out (`filterlab.shrinking`); along axes that do not
+            shrink nothing changes. With `labels`, of their indicators. False: the reconstruction itself at the new
+            voxels, in which such frequencies are aliased. Default: False, with a warning where steps are longer than
+            1.25 voxels.
         progress: told what part is done, 0 … 1.
 
-    Exactly one of spacing, shape and like must be given, or none with an affine. This reconstructs, it does not
-    anti-alias: when the new grid is coarser than the old one, blur first. Cost: one pass of S taps per axis; memory:
-    about two volumes of the larger size.
+    Exactly one of spacing, shape and like must be given, or none with an affine. Memory beyond input and output, where
+    no derivative is asked: on aligned grids a tenth of the output in float32, up to 0.7 of it where that is small or
+    more than one number a voxel is needed; on turned grids and on tetrahedra the coefficients, too, with `antialias`
+    the samples in float32.
 
     Returns:
         a Volume, differentiable in the samples.
@@ -100,30 +115,69 @@ def resample(
         )
     if not elsewhere:
         fill = None
+    how = _How(method, prefilter, boundary, _antialiased(antialias, method, labels, sites))
     if labels or method is METHODS["nearest"]:
         if dtype not in (None, volume.dtype):
             raise ValueError(f"nearest samples and labels keep their type, {volume.dtype}; got dtype={dtype}")
         samples = volume.samples if nan == "propagate" else resolved(volume.samples, nan)[0]
         _check_fill(fill, volume.dtype)
-        take = _nearest(samples, boundary, sites)
-        if labels:
-            take = _labelled(samples, method, boundary, prefilter, sites, progress)
+        take = _labelled(samples, how, sites, progress) if labels else _nearest(samples, boundary, sites)
         return Volume.with_geometry(_made(take, samples, sites, volume.dtype, fill, progress), geometry)
     dtype = _type_of_result(volume.samples, dtype)
     working = torch.promote_types(dtype, torch.float32)
     samples, unknown = resolved(volume.samples, nan)
+    if how.antialias and not how.composed(sites):
+        samples = contract(samples, _smoothing(how, sites, working), working)
     if sites.aligned and isinstance(method, TensorProduct):
-        contraction = _contraction(method, prefilter, boundary, sites, working)
+        contraction = _contraction(how, sites, working)
         at_once = unknown is None and fill is None and progress is None
         if at_once and dtype == working and fused(samples, contraction):
             return Volume.with_geometry(contract(samples, contraction, working), geometry)
         take = _contracted(samples, contraction, working)
         if unknown is not None:
-            take = _with_unknown(take, unknown, _reached(method, boundary, sites))
+            take = _with_unknown(take, unknown, _reached(how, sites))
     else:
         samples = samples if torch.promote_types(samples.dtype, torch.float32) == working else samples.to(working)
         take = _pointwise(reconstruct(samples, method, boundary=boundary, prefilter=prefilter, nan=nan), sites, working)
     return Volume.with_geometry(_made(take, samples, sites, dtype, fill, progress), geometry)
+
+
+@dataclass(frozen=True)
+class _How:
+    """A method and how it is used; see `resample`."""
+
+    method: Method
+    prefilter: bool
+    boundary: Boundary
+    antialias: bool
+
+    def composed(self, sites: Sites) -> bool:
+        """Whether values are rows of one kernel along each axis, of which a low-pass can be a part."""
+        return sites.aligned and isinstance(self.method, TensorProduct) and self.method.terms is None
+
+    def smooths(self, sites: Sites, axis: int) -> bool:
+        """Whether an axis shrinks, and is not to be aliased."""
+        return self.antialias and sites.size[axis] > 1 and sites.steps[axis] > 1 + NEARER
+
+    def given(self, kernel: PiecewisePolynomial, dtype: torch.dtype) -> Given:
+        """How samples are reconstructed along an axis by a kernel of the method."""
+        own = self.method.prefilter if isinstance(self.method, TensorProduct | Tetrahedral) else prefilters.IDENTITY
+        return Given(kernel, own if self.prefilter else prefilters.IDENTITY, self.boundary, dtype)
+
+
+def _antialiased(antialias: bool | None, method: Method, labels: bool, sites: Sites) -> bool:
+    """Raises ValueError where it is asked for and makes no sense; warns where it is not, and is likely to be missed."""
+    taken = method is METHODS["nearest"] and not labels
+    if antialias and taken:
+        raise ValueError("antialias=True needs another method, or labels=True: nearest samples are taken as they stand")
+    longest = max((s for s, n in zip(sites.steps, sites.size, strict=True) if n > 1), default=0.0)
+    if antialias is None and not taken and longest > UNTOLD:
+        message = (
+            f"the new grid has steps of up to {longest:.3g} voxels: frequencies that it does not hold are aliased; "
+            "antialias=True leaves them out, antialias=False says that this is known"
+        )
+        warnings.warn(AliasingWarning(message), stacklevel=3)
+    return bool(antialias)
 
 
 def _type_of_result(samples: Tensor, dtype: torch.dtype | None) -> torch.dtype:
@@ -207,16 +261,31 @@ def _finished(take: Take, part: Part, sites: Sites, dtype: torch.dtype, fill: fl
 # --- separable methods on aligned grids -------------------------------------------------------------------------------
 
 
-def _contraction(
-    method: TensorProduct, prefilter: bool, boundary: Boundary, sites: Sites, dtype: torch.dtype
-) -> Contraction:
+def _contraction(how: _How, sites: Sites, dtype: torch.dtype) -> Contraction:
     """The matrices that turn samples into values at the sites."""
-    applied = method.prefilter if prefilter else prefilters.IDENTITY
+    assert isinstance(how.method, TensorProduct)
     terms = []
-    for term in method.separable:
-        rows = [rows_of(sites.along(a), n, term.kernels[a], applied, boundary, dtype) for a, n in enumerate(sites.size)]
-        terms.append((rows[0].scaled(term.weight), rows[1], rows[2]))
+    for term in how.method.separable:
+        x, y, z = (_rows(how, sites, axis, how.given(kernel, dtype)) for axis, kernel in enumerate(term.kernels))
+        terms.append((x.scaled(term.weight), y, z))
     return Contraction(terms)
+
+
+def _rows(how: _How, sites: Sites, axis: int, given: Given) -> Rows:
+    x, n = sites.along(axis), sites.size[axis]
+    if how.smooths(sites, axis) and how.composed(sites):
+        return projected(x, float(sites.matrix[axis, axis]), n, given)
+    return rows_of(x, n, given)
+
+
+def _smoothing(how: _How, sites: Sites, dtype: torch.dtype) -> Contraction:
+    """The matrices of a low-pass of the samples where they are, for what comes after."""
+    given = how.given(how.method.kernel if isinstance(how.method, TensorProduct) else bspline(2), dtype)
+    x, y, z = (
+        smoothing(sites.steps[axis], n, given) if how.smooths(sites, axis) else Rows.identity(n)
+        for axis, n in enumerate(sites.size)
+    )
+    return Contraction([(x, y, z)])
 
 
 def _contracted(samples: Tensor, contraction: Contraction, dtype: torch.dtype) -> Take:
@@ -228,11 +297,13 @@ def _contracted(samples: Tensor, contraction: Contraction, dtype: torch.dtype) -
     return take
 
 
-def _reached(method: TensorProduct, boundary: Boundary, sites: Sites) -> Contraction:
-    """The same with 1 for every coefficient that a kernel reaches, without prefilter."""
+def _reached(how: _How, sites: Sites) -> Contraction:
+    """The same with 1 for every coefficient that a kernel reaches, without prefilter: one of the coarser grid."""
+    assert isinstance(how.method, TensorProduct)
     terms: list[Axes] = []
-    for term in method.separable:
-        x, y, z = (reached(sites.along(a), n, term.kernels[a], boundary) for a, n in enumerate(sites.size))
+    for term in how.method.separable:
+        widths = (k.support * (sites.steps[a] if how.smooths(sites, a) else 1) for a, k in enumerate(term.kernels))
+        x, y, z = (reached(sites.along(a), sites.size[a], width, how.boundary) for a, width in enumerate(widths))
         terms.append((x, y, z))
     return Contraction(terms)
 
@@ -290,29 +361,28 @@ def _chosen(x: Tensor, n: int, boundary: Boundary) -> tuple[Tensor, Tensor]:
     return boundary.source(index, n), inside
 
 
-def _labelled(
-    samples: Tensor,
-    method: Method,
-    boundary: Boundary,
-    prefilter: bool,
-    sites: Sites,
-    progress: Progress | None,
-) -> Take:
+def _labelled(samples: Tensor, how: _How, sites: Sites, progress: Progress | None) -> Take:
     """The label that a method finds strongest at every site."""
-    if not (sites.aligned and isinstance(method, TensorProduct)):
+    if isinstance(how.method, TensorProduct) and sites.aligned and (how.composed(sites) or not how.antialias):
+        return _labelled_in_parts(samples, _contraction(how, sites, torch.float32), how.boundary)
 
-        def resampled(indicator: Tensor) -> Tensor:
-            field = reconstruct(indicator.float(), method, boundary=boundary, prefilter=prefilter)
-            return _made(_pointwise(field, sites, torch.float32), indicator, sites, torch.float32, None)
+    def resampled(indicator: Tensor) -> Tensor:
+        values = indicator.float()
+        if how.antialias:
+            values = contract(values, _smoothing(how, sites, torch.float32), torch.float32)
+        field = reconstruct(values, how.method, boundary=how.boundary, prefilter=how.prefilter)
+        return _made(_pointwise(field, sites, torch.float32), indicator, sites, torch.float32, None)
 
-        whole = strongest(samples, resampled, boundary, progress or (lambda part: None))
-        return lambda part: whole[(..., *part, slice(None))]
-    contraction = _contraction(method, prefilter, boundary, sites, torch.float32)
+    whole = strongest(samples, resampled, how.boundary, progress or (lambda part: None))
+    return lambda part: whole[(..., *part, slice(None))]
+
+
+def _labelled_in_parts(samples: Tensor, contraction: Contraction, boundary: Boundary) -> Take:
+    """Of every part only the labels that it depends on."""
 
     def take(part: Part) -> Tensor:
         own, (planes, lines) = contraction.part(*part)
-        return strongest(
-            samples[..., planes, lines, :], lambda i: contract(i.view(torch.uint8), own, torch.float32), boundary
-        )
+        needed = samples[..., planes, lines, :]
+        return strongest(needed, lambda i: contract(i.view(torch.uint8), own, torch.float32), boundary)
 
     return take

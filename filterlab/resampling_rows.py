@@ -9,6 +9,8 @@ row is one of a sparse matrix, exact at both ends and under every boundary.
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -23,23 +25,32 @@ from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary
 
 
-def rows_of(
-    x: Tensor, n: int, kernel: PiecewisePolynomial, prefilter: Prefilter, boundary: Boundary, dtype: torch.dtype
-) -> Rows:
-    """The matrix from n samples to values at x (R,) float64.
+@dataclass(frozen=True)
+class Given:
+    """How samples are reconstructed along an axis.
 
-    Args:
-        dtype: below whose rounding the tails of the cardinal kernel are left out.
+    Attributes:
+        kernel, prefilter, boundary: φ, p, and how samples go on beyond the ends.
+        dtype: below whose rounding the tails of weights are left out.
     """
-    first, weights = taps(x, kernel)
-    impulse = x.new_tensor(impulse_response(prefilter, dtype))
-    return folded(first - len(impulse) // 2, convolved(weights, impulse), n, boundary)
+
+    kernel: PiecewisePolynomial
+    prefilter: Prefilter
+    boundary: Boundary
+    dtype: torch.dtype
 
 
-def reached(x: Tensor, n: int, kernel: PiecewisePolynomial, boundary: Boundary) -> Rows:
-    """The matrix with a 1, or more, wherever the kernel at x (R,) reaches one of n samples."""
-    first, weights = taps(x, kernel)
-    return folded(first, torch.ones_like(weights), n, boundary)
+def rows_of(x: Tensor, n: int, given: Given) -> Rows:
+    """The matrix from n samples to values at x (R,) float64."""
+    first, weights = taps(x, given.kernel)
+    impulse = x.new_tensor(impulse_response(given.prefilter, given.dtype))
+    return folded(first - len(impulse) // 2, convolved(weights, impulse), n, given.boundary)
+
+
+def reached(x: Tensor, n: int, width: float, boundary: Boundary) -> Rows:
+    """The matrix with a 1, or more, wherever a kernel of some width at x (R,) reaches one of n samples."""
+    first = (x - width / 2).floor().long() + 1
+    return folded(first, x.new_ones(len(x), math.ceil(width)), n, boundary)
 
 
 def taps(x: Tensor, kernel: PiecewisePolynomial) -> tuple[Tensor, Tensor]:
@@ -63,9 +74,14 @@ def impulse_response(prefilter: Prefilter, dtype: torch.dtype) -> tuple[float, .
 
 def convolved(weights: Tensor, impulse: Tensor) -> Tensor:
     """Σ_i impulse_i weights_{k−i}: (R, S) with (P,) to (R, S + P − 1)."""
-    _, count = weights.shape
-    parts = (pad(w * impulse, (i, count - 1 - i)) for i, w in enumerate(weights.split(1, -1)))
-    return torch.stack(list(parts)).sum(0)
+    longer, shorter = weights, impulse.expand(len(weights), -1)
+    if longer.shape[1] < shorter.shape[1]:
+        longer, shorter = shorter, longer
+    count = shorter.shape[1]
+    total = weights.new_zeros(len(weights), longer.shape[1] + count - 1)
+    for i in range(count):
+        total = total + pad(shorter[:, i, None] * longer, (i, count - 1 - i))
+    return total
 
 
 def folded(first: Tensor, weights: Tensor, n: int, boundary: Boundary) -> Rows:

@@ -72,7 +72,7 @@ def cases() -> dict[str, tuple[Volume, dict]]:
         "in float64": (samples, to(dtype=torch.float64)),
         "one plane": (volume(torch.float32, (1, 700, 700)), to((1, 1400, 1400), boundary="border")),
         "the same grid": (volume(torch.float32, NEW), to()),
-        "a coarser grid": (volume(torch.float32, (160, 180, 200)), to((107, 120, 133))),
+        "a coarser grid": (volume(torch.float32, (160, 180, 200)), to((107, 120, 133), antialias=True)),
         "filled outside": (samples, onto(np.eye(4), fill=0.0)),
         "NaN propagated": (incomplete(), to(nan="propagate")),
         "nearest uint8": (volume(torch.uint8), to(method="nearest")),

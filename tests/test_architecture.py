@@ -38,6 +38,7 @@ FLOORS = {
     "surfaces": 4,
     "labels": 4,
     "resampling_rows": 3,
+    "shrinking": 4,
     "sites": 1,
     "resampling": 5,
     "nn": 5,

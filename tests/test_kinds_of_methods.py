@@ -85,10 +85,10 @@ def test_fields_and_their_options() -> None:
 
 def test_resampling_is_pointwise() -> None:
     volume = Volume(samples(5, 6, 7), spacing=(1.0, 1.5, 2.0))
-    found, expected = (fl.resample(volume, name, shape=(7, 5, 9)) for name in (NAME, "trilinear"))
+    found, expected = (fl.resample(volume, name, shape=(7, 5, 9), antialias=False) for name in (NAME, "trilinear"))
     torch.testing.assert_close(found.samples, expected.samples, rtol=0, atol=1e-12)
     batch = Volume(samples(2, 3, 5, 6, 7))
-    assert fl.resample(batch, NAME, shape=(4, 4, 4)).shape == (2, 3, 4, 4, 4)
+    assert fl.resample(batch, NAME, shape=(4, 4, 4), antialias=False).shape == (2, 3, 4, 4, 4)
 
 
 def test_what_has_no_closed_form_is_measured_only() -> None:

@@ -17,6 +17,7 @@ RNG = np.random.default_rng(3)
 TURNED = np.eye(4)
 TURNED[:3, :3] = np.linalg.qr(RNG.normal(size=(3, 3)))[0] * [0.7, 0.9, 0.6]
 TURNED[:3, 3] = [1.0, 2.0, 0.5]
+pytestmark = pytest.mark.filterwarnings("ignore::filterlab.resampling.AliasingWarning")  # grids are coarser on purpose
 INTEGERS = [torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64]
 
 

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
+import subprocess
+import sys
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +23,7 @@ from tests.test_volume import rotated
 
 every_method = pytest.mark.parametrize("method", METHODS)
 every_boundary = pytest.mark.parametrize("boundary", Boundary)
+pytestmark = pytest.mark.filterwarnings("ignore::filterlab.resampling.AliasingWarning")  # grids are coarser on purpose
 
 
 def volume(*shape: int) -> torch.Tensor:
@@ -275,3 +281,37 @@ def test_grids_that_do_not_overlap_are_refused():
     touching = Volume(torch.zeros(3, 3, 3), origin=(5.5, 0, 0))  # on the face of the box
     assert resample(source, like=touching, fill=7.0).samples[0, 0].tolist()[1:] == [7, 7]
     assert resample(source, like=touching).shape == (3, 3, 3)
+
+
+# --- far away, and memory ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("method", ["nearest", "trilinear", "tricubic", "qss"])
+def test_what_is_far_from_the_origin_loses_no_digits(method, turned):
+    """Grids at UTM coordinates, in float32, against the same grids at the origin in float64."""
+    far = np.array([5e5, 4e6, 120.0])
+    source = Volume(volume(9, 10, 11), affine=rotated(spacing=(0.5, 0.25, 1.0), origin=(0, 0, 0)))
+    step = rotated(spacing=(0.9, 0.8, 0.7), origin=(1.5, 2.5, 3.5)) if turned else np.diag([0.7, 0.6, 0.9, 1.0])
+    like = Volume(torch.zeros(7, 8, 9), affine=source.affine @ step)
+    exact = resample(source, method, like=like, boundary="reflect")
+
+    def moved(grid):
+        affine = np.array(grid.affine)
+        affine[:3, 3] += far
+        return Volume(grid.samples.float(), affine=affine)
+
+    found = resample(moved(source), method, like=moved(like), boundary="reflect")
+    laws.assert_close(found.samples, exact.samples, 3e-6)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux what memory is resident")
+def test_memory_beyond_input_and_output_is_less_than_a_volume():
+    """By any method, type and boundary, on coarser and turned grids too; a tenth where nothing but sums is needed."""
+    allocator = {"MALLOC_MMAP_THRESHOLD_": "131072", "OMP_NUM_THREADS": "1"}  # what is freed goes back at once
+    command = [sys.executable, "-W", "ignore", "-m", "tests.peak_memory"]
+    done = subprocess.run(command, env=os.environ | allocator, capture_output=True, text=True, check=True)
+    taken = json.loads(done.stdout)
+    assert len(taken) == 25
+    assert max(taken.values()) <= 1, taken
+    assert max(taken[f"{m}"] for m in ("trilinear uint8", "triquadratic int16", "tricubic border")) <= 0.25, taken

@@ -1,6 +1,6 @@
 """The numerical core: fused operations, their adjoints, and what they are checked against.
 
-    stencil ──▶ gather place prefilter march raycast bounds ──▶ reference ──▶ cpu, cuda ──▶ differentiable ──▶ here
+    stencil ──▶ gather place prefilter contract march raycast bounds ─▶ reference ─▶ cpu, cuda ─▶ differentiable ─▶ here
     what is summed    descriptions of every op              plain twins    programs     choice, adjoint
     tree    ──▶ quadrics
 

@@ -41,6 +41,10 @@ class Rows:
         starts = torch.cat((counts.new_zeros(1), counts.cumsum(0)))
         return cls(starts, keys % shape[1], summed, shape[1])
 
+    @classmethod
+    def identity(cls, n: int) -> Rows:
+        return cls(torch.arange(n + 1), torch.arange(n), torch.ones(n, dtype=torch.float64), n)
+
     @property
     def count(self) -> int:
         """R."""
