@@ -614,9 +614,23 @@ def test_render_of_a_surface_needs_a_volume_and_a_level(
     assert "cells may hold the level" in capfd.readouterr().out
 
 
+def test_a_volume_is_shown_as_it_is_and_its_scene_printed(
+    volume_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pictures = tmp_path / "a.png", tmp_path / "b.png"
+    assert main(["render", str(volume_file), "-o", str(pictures[0]), "--size", "24", "16"]) == 0
+    assert load_image(pictures[0]).std() > 0.02
+    capsys.readouterr()
+    assert main(["scene", str(volume_file), "--size", "24", "16"]) == 0
+    scene = tmp_path / "a.yaml"
+    scene.write_text(capsys.readouterr().out)
+    assert main(["render", str(scene), "-o", str(pictures[1])]) == 0
+    assert torch.equal(*map(load_image, pictures))
+
+
 def test_mistakes_about_levels_are_named(capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.png"
-    fails(capsys, ["render", volume_file, "-o", out], 1, "expected a scene", "--level, --mip or --slice z")
+    fails(capsys, ["mesh", volume_file, "-o", out.with_suffix(".ply")], 1, "a volume and --level; got neither")
     fails(capsys, ["render", volume_file, "--level", "high", "-o", out], 1, "surface.level: expected a valid number")
     fails(capsys, ["render", tmp_path / "no.nrrd", "--level", "1", "-o", out], 1, "found none at")
     fails(capsys, ["render", volume_file, "--level", "1", "--step", "1", "-o", out], 1, "hit exactly")

@@ -17,12 +17,13 @@ from filterlab.cli import main
 from filterlab.cli.options import MEMORY, TIME, quantity
 from filterlab.cli.outcome import UsageError
 from filterlab.fields.base import Field
-from filterlab.io.config import loads_config
+from filterlab.io.config import dump_data, loads_config
 from filterlab.recommendation import ErrorEstimate, Recommendation, recommend, report, ways
 from filterlab.recommendation.choice import IMAGE, Question, _marched, choose
 from filterlab.recommendation.errors import Distance, MethodErrors, Yardstick
 from filterlab.recommendation.survey import inner_box
 from filterlab.recommendation.ways import WayCost
+from filterlab.scenes.default import suggested
 from filterlab.scenes.model import Scene
 from filterlab.signals import Signal
 
@@ -480,9 +481,8 @@ def test_nan_voxels_are_refused_or_filled(samples) -> None:
 
 def test_the_scene_is_one_that_render_takes(found, samples, tmp_path) -> None:
     fl.save_volume(fl.Volume(samples), tmp_path / "v.nrrd")
-    from filterlab.io.config import dump_data
-
-    scene = loads_config(dump_data(report.scene(found, str(tmp_path / "v.nrrd"))), Scene)
+    look = suggested(fl.reconstruct(samples, "trilinear"))
+    scene = loads_config(dump_data(report.scene(found, str(tmp_path / "v.nrrd"), look)), Scene)
     assert scene.method is not None
     assert scene.method.name == found.chosen.method
 
@@ -515,7 +515,7 @@ def no_work(monkeypatch) -> None:
     ("samples", "options", "message"),
     [
         (1e8 + 1e-3 * torch.rand(8, 8, 8, dtype=torch.float64), [], "control points of the transfer function coincide"),
-        (torch.rand(8, 8, 8).where(torch.rand(8, 8, 8) > 0.1, math.nan), ["--nan", "propagate"], "expected --nan fill"),
+        (torch.rand(8, 8, 8).where(torch.rand(8, 8, 8) > 0.1, math.nan), [], "NaN of 512"),
     ],
     ids=["nearly constant", "not a number"],
 )

@@ -62,7 +62,7 @@ class Mesh:
 
         scene = scene_asked_for(self.scene, overrides, self.output)
         if scene.surface is None:
-            raise ValueError(f"expected a scene with a surface; this one shows a medium: {self.scene}")
+            raise ValueError(f"expected a scene with a surface, or a volume and --level; got neither: {self.scene}")
         with progress_bar(self.quiet) as progress, reading(progress):
             prepared = build(scene)
         assert isinstance(prepared, PreparedSurface)

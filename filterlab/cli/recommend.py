@@ -73,8 +73,9 @@ class Recommend:
             check_name(what, name, known)
 
         from filterlab.io.volumes import describe
-        from filterlab.missing_values import resolved
+        from filterlab.methods import reconstruct
         from filterlab.recommendation import recommend, report
+        from filterlab.scenes.default import suggested
 
         part = {"frame": self.frame, "channel": self.channel}
         if self.output is not None and len(shape := describe(self.volume, **part).shape) != 3:
@@ -84,13 +85,10 @@ class Recommend:
         file: str | dict[str, Any] = str(self.volume.resolve())
         if chosen := {name: index for name, index in part.items() if index is not None}:
             file = {"file": file, **chosen}
-        voxel = min(volume.spacing)
+        look: dict[str, Any] = {}
         if self.output is not None:  # what would not render is refused before the work
-            samples, unknown = resolved(volume.samples, self.nan)
-            if unknown is not None:
-                raise ValueError("expected --nan fill to write a scene with; with propagate its picture has NaN in it")
-            low, high = samples.aminmax()
-            _check_scene(self.output, report.shown(file, (float(low), float(high)), voxel))
+            look = suggested(reconstruct(volume, "trilinear", boundary=self.boundary, nan=self.nan))
+            _check_scene(self.output, {"volume": file, **look})
         with progress_bar(self.quiet) as progress:
             found = recommend(
                 volume,
@@ -107,7 +105,7 @@ class Recommend:
         else:
             show(report.text(found))
         if output is not None:
-            _write_yaml(output.path, report.scene(found, file, voxel))
+            _write_yaml(output.path, report.scene(found, file, look))
             output.tell("a scene")
         return OK if found.pick is not None else NOTHING_FITS
 

@@ -30,10 +30,12 @@ class Render:
     A scene is a YAML file: what is shown, how it is reconstructed, the transfer function or the surface, the camera,
     the lights (filterlab scene --reference). Any of its values can be changed on the command line, after the name of
     the scene, by its path in the file; --frame and --channel choose one of several volumes in a file. In place of a
-    scene, a volume file is enough for the surface at a --level, its largest values (--mip) or a slice (--slice z).
-    --legend adds the colours and their values to the picture.
+    scene, a volume file is enough: it is shown by colours and a camera that its values suggest (filterlab scene VOLUME
+    prints that scene), or as the surface at a --level, its largest values (--mip) or a slice (--slice z). --legend adds
+    the colours and their values to the picture.
 
     examples:
+      filterlab render engine.nrrd -o engine.png
       filterlab render engine.yaml -o engine.png
       filterlab render engine.yaml -o notch.png --method notch --size 512 512
       filterlab render engine.yaml -o zoom.jpg --camera.window 0.4 0.4 0.6 0.6 --volume other.nrrd
@@ -44,7 +46,7 @@ class Render:
     """
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml | VOLUME")]
-    """The scene; or a volume with --level, --mip or --slice."""
+    """The scene, or a volume."""
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
     """The picture to write: a name that ends in .png or .jpg (quality 95); a file of that name is replaced. With
     --turntable .gif, .png (animated), or a folder for numbered .png files, which must be new or empty."""

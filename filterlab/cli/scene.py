@@ -14,17 +14,18 @@ from filterlab.cli.scenes import scene_asked_for
 
 @dataclass(frozen=True)
 class Scene:
-    """Tell what scene files may say; or show one with everything that it leaves out.
+    """Tell what scene files may say; or show one with everything that it leaves out, or that of a volume.
 
     Values of a scene can be changed as for `filterlab render`, after its name.
 
     examples:
       filterlab scene --reference
       filterlab scene engine.yaml --method notch
+      filterlab scene engine.nrrd > engine.yaml
     """
 
-    scene: Annotated[Positional[Path | None], arg(metavar="SCENE.yaml")] = None
-    """The scene that is shown."""
+    scene: Annotated[Positional[Path | None], arg(metavar="SCENE.yaml | VOLUME")] = None
+    """The scene that is shown, or a volume: then the scene that shows it."""
     reference: bool = False
     """Print the reference of scene files instead: every key, what it may be, its unit, its default (Markdown)."""
 

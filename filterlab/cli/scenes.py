@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
 
 def scene_asked_for(path: Path, overrides: dict[str, str], output: Path | None) -> Scene:
-    """The scene in a file; or that of a volume, with a level, a mip or a slice among the overrides."""
+    """The scene in a file; or of a volume, as overrides ask, its surface, greatest values or slice, else as it is."""
     from filterlab.scenes.build import load_scene, surface_scene, values_scene
+    from filterlab.scenes.default import default_scene
 
     part = {name: overrides.pop(name) for name in ("frame", "channel") if name in overrides}
     level = overrides.pop("level", None)
@@ -29,7 +30,7 @@ def scene_asked_for(path: Path, overrides: dict[str, str], output: Path | None) 
     elif {name.partition(".")[0] for name in chosen} & {"mip", "slice"}:
         scene = values_scene(path, chosen)
     else:
-        raise ValueError(f"expected a scene, a .yaml file; of a volume itself, --level, --mip or --slice z: {path}")
+        scene = default_scene(path, chosen)
     if scene.volume is not None and output is not None:
         check_not_input(output, Path(scene.volume.file))
     check_device(scene.device)

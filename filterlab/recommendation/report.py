@@ -11,7 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 from filterlab.recommendation.choice import IMAGE, Candidate, Recommendation
-from filterlab.recommendation.errors import range_of
 from filterlab.recommendation.survey import INNER
 
 COUNTED = {
@@ -159,35 +158,23 @@ def data(found: Recommendation) -> dict[str, Any]:
     }
 
 
-def scene(found: Recommendation, file: str | dict[str, Any], voxel: float = 1.0) -> dict[str, Any]:
-    """A scene that `filterlab render` takes: the volume, reconstructed as recommended, under a ramp of opacity."""
+def scene(found: Recommendation, file: str | dict[str, Any], look: dict[str, Any]) -> dict[str, Any]:
+    """A scene that `filterlab render` takes: the volume, reconstructed as recommended.
+
+    Args:
+        file: the volume, as a scene has it.
+        look: all else, as `scenes.default.suggested` tells it; a step that is recommended comes before its own.
+    """
     chosen = found.chosen
     method: dict[str, Any] = {"name": chosen.method, "scheme": chosen.scheme, "boundary": found.boundary}
     method |= {"storage": chosen.storage} if chosen.storage else {}
     method |= {"nan": found.nan} if found.nan != "refuse" else {}
     return {
         "description": f"{chosen.method}, recommended for an error of {percent(found.max_error)} ({found.task})",
-        **shown(file, found.value_range, voxel),
-        "method": method,
-        "step": chosen.step or 0.5,
-    }
-
-
-def shown(file: str | dict[str, Any], value_range: tuple[float, float], voxel: float) -> dict[str, Any]:
-    """What of a scene is known before anything is recommended: the volume, and how it is shown."""
-    low, span = value_range[0], range_of(value_range)
-    points = [(0.15, (0.1, 0.15, 0.3), 0.0), (0.5, (0.75, 0.55, 0.4), 0.15), (1.0, (1.0, 0.97, 0.9), 0.6)]
-    return {
         "volume": file,
-        "transfer": {
-            "unit": voxel,
-            "points": [
-                {"value": low + part * span, "color": list(color), "opacity": opacity}
-                for part, color, opacity in points
-            ],
-        },
-        "lighting": {"ambient": 0.3, "diffuse": 0.7},
-        "termination": 0.002,
+        "method": method,
+        **look,
+        **({"step": chosen.step} if chosen.step else {}),
     }
 
 
