@@ -138,6 +138,8 @@ def resample(
             take = _with_unknown(take, unknown, _reached(how, sites))
     else:
         samples = samples if torch.promote_types(samples.dtype, torch.float32) == working else samples.to(working)
+        if unknown is not None:  # they were filled; the field is to know them
+            samples = samples.masked_fill(unknown, torch.nan)
         take = _pointwise(reconstruct(samples, method, boundary=boundary, prefilter=prefilter, nan=nan), sites, working)
     return Volume.with_geometry(_made(take, samples, sites, dtype, fill, progress), geometry)
 

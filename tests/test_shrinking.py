@@ -151,6 +151,19 @@ def test_unknown_voxels_are_told_where_the_wider_kernel_reaches_them():
     assert torch.equal(finer, resample(samples, "trilinear", shape=(1, 1, 48), nan="propagate").samples.isnan())
 
 
+@pytest.mark.parametrize("antialias", [True, False])
+def test_unknown_voxels_are_missing_on_turned_grids_too(antialias):
+    samples = noise(6, 7, 8)
+    samples[2, 3, 4] = torch.nan
+    affine = rotated((1.5, 1.5, 1.5), (0, 0, 0))
+    affine[:3, 3] = np.array([4, 3, 2]) - affine[:3, :3] @ [1.5, 1.5, 1.5]
+    for method in ("tricubic", "qss"):
+        how = {"like": Volume(torch.zeros(4, 4, 4), affine=affine), "antialias": antialias}
+        found = resample(samples, method, nan="propagate", **how).samples.isnan()
+        assert 0 < int(found.sum()) < found.numel()
+        assert not resample(samples, method, nan="fill", **how).samples.isnan().any()
+
+
 def test_shrinking_without_a_word_is_told_once_per_place():
     samples = noise(4, 5, 13)
     turned = Volume(samples[..., :3], affine=rotated((2, 1, 1), (0, 0, 0)))
