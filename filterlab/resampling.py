@@ -41,7 +41,19 @@ UNTOLD = 1.25  # voxels of the old grid that a step may have before a warning
 
 
 class AliasingWarning(UserWarning):
-    """A grid is coarser than that of the samples, and nothing is said of what it does not hold."""
+    """A grid is coarser than that of the samples, and nothing is said of what it does not hold.
+
+    Attributes:
+        on_command_line: what is told of it there, where the option has another name.
+    """
+
+    def __init__(self, steps: float) -> None:
+        what = (
+            f"the new grid has steps of up to {steps:.3g} voxels: frequencies that it does not hold are aliased; "
+            "{} leaves them out"
+        )
+        super().__init__(what.format("antialias=True") + ", antialias=False says that this is known")
+        self.on_command_line = what.format("--antialias")
 
 
 def resample(
@@ -174,11 +186,7 @@ def _antialiased(antialias: bool | None, method: Method, labels: bool, sites: Si
         raise ValueError("antialias=True needs another method, or labels=True: nearest samples are taken as they stand")
     longest = max((s for s, n in zip(sites.steps, sites.size, strict=True) if n > 1), default=0.0)
     if antialias is None and not taken and longest > UNTOLD:
-        message = (
-            f"the new grid has steps of up to {longest:.3g} voxels: frequencies that it does not hold are aliased; "
-            "antialias=True leaves them out, antialias=False says that this is known"
-        )
-        warnings.warn(AliasingWarning(message), stacklevel=3)
+        warnings.warn(AliasingWarning(longest), stacklevel=3)
     return bool(antialias)
 
 

@@ -11,8 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
-from filterlab import METHODS, Volume, save_volume, signals
+from filterlab import METHODS, Volume, load_volume, resample, save_volume, signals
 from filterlab.cli import main
 from filterlab.cli.terminal import progress_bar
 from filterlab.world import World
@@ -192,3 +193,17 @@ EXPECTED = {
     "recommend": {"reading", "errors", "costs"},
     "info": {"reading", "counting"},
 }
+
+
+def test_shrinking_is_told_of_or_antialiased(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    volume = Volume(torch.rand(8, 8, 8))
+    save_volume(volume, tmp_path / "in.nrrd")
+    line = ["resample", str(tmp_path / "in.nrrd"), "--shape", "3", "3", "3", "-o", str(tmp_path / "out.nrrd"), "-q"]
+    assert main(line) == 0
+    assert capsys.readouterr().err.count("--antialias leaves them out") == 1
+    assert main([*line, "--antialias"]) == 0
+    assert capsys.readouterr().err == ""
+    found = load_volume(tmp_path / "out.nrrd").samples
+    assert torch.equal(found, resample(volume, shape=(3, 3, 3), antialias=True).samples)
+    assert main([*line, "--antialias", "--method", "nearest"]) == 2
+    assert "nearest takes samples as they are" in capsys.readouterr().err

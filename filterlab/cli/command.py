@@ -26,7 +26,6 @@ from filterlab.cli.scene import Scene
 from filterlab.cli.scenes import split_overrides
 from filterlab.cli.sdf import Sdf
 from filterlab.cli.terminal import tell
-from filterlab.io.warned import VolumeFileWarning
 from filterlab.names import unknown_name
 
 DESCRIPTION = """Reconstruction filters for sampled volumes: look at scans, resample and convert them, compare methods.
@@ -86,16 +85,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _warnings_told() -> Iterator[None]:
-    """Tells what is odd about volume files in one line each on stderr."""
+    """Tells what filterlab warns of in one line each on stderr."""
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-        if issubclass(category, VolumeFileWarning):
-            tell(str(message))
+        if category.__module__.startswith("filterlab."):
+            tell(getattr(message, "on_command_line", str(message)))
         else:
             usual(message, category, *where, **more)
 
     with warnings.catch_warnings():
-        warnings.simplefilter("always", VolumeFileWarning)
+        warnings.filterwarnings("always", category=UserWarning, module=r"filterlab\.")
         usual, warnings.showwarning = warnings.showwarning, show
         yield
 

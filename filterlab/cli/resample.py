@@ -30,12 +30,12 @@ class Resample:
     """Put a volume on another grid: finer, coarser, or that of another volume.
 
     The volume is reconstructed by the chosen method and sampled anew; it stays where it is in the world, or is moved by
-    --affine first. Making it coarser does not blur first. Files: NRRD, NIfTI, TIFF stacks, .npy, .npz and .raw with a
-    sidecar are read; .nrrd, .nii, .nii.gz, .npy and .npz are written.
+    --affine first. On a coarser grid --antialias leaves out what it does not hold. Files: NRRD, NIfTI, TIFF stacks,
+    .npy, .npz and .raw with a sidecar are read; .nrrd, .nii, .nii.gz, .npy and .npz are written.
 
     examples:
       filterlab resample engine.nrrd -o fine.nrrd --method notch --spacing 0.5 0.5 0.5
-      filterlab resample engine.nrrd -o small.nii.gz --shape 128 128 64 --dtype input
+      filterlab resample engine.nrrd -o small.nii.gz --shape 128 128 64 --antialias --dtype input
       filterlab resample pet.nii.gz -o pet_on_ct.nii.gz --like ct.nii.gz --fill 0
       filterlab resample cells.ome.tif -o nuclei.nrrd --channel 1 --frame 0 --spacing 0.2 0.2 0.2
       filterlab resample organs.nii.gz -o organs_on_ct.nii.gz --like ct.nii.gz --labels
@@ -79,6 +79,8 @@ class Resample:
     """The value of voxels outside of IN, for --like, --affine; `nan` too. Default: none, the boundary rules there."""
     labels: bool = False
     """The values of IN are names, not amounts: of each the method reconstructs where it is, and the strongest wins."""
+    antialias: bool = False
+    """Leave out what a coarser grid does not hold; without it fine detail comes back as coarse patterns."""
     dtype: str | None = None
     """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN.
     Default: `input` for labels and for the method nearest, else float32, or float64 if that is what the values need."""
@@ -101,6 +103,8 @@ class Resample:
         check_name("method", self.method, names.methods())
         check_name("boundary", self.boundary, names.BOUNDARIES)
         check_name("nan", self.nan, names.NAN_CHOICES)
+        if self.antialias and self.method == "nearest" and not self.labels:
+            raise UsageError("expected another method, or --labels, for --antialias; nearest takes samples as they are")
 
         import numpy as np
 
@@ -130,6 +134,7 @@ class Resample:
             grid = {"like": Volume.with_geometry(torch.zeros(()).expand(target.shape[-3:]), target.geometry)}
         grid |= {"affine": affine, "boundary": self.boundary}
         asked: dict = {"dtype": None if keeps or stored is None else working, "labels": self.labels, "fill": self.fill}
+        asked["antialias"] = self.antialias or None
         with progress_bar(self.quiet) as progress:
             volume = load(self.input, self.frame, self.channel, progress, limit)
             if not keeps:
