@@ -323,7 +323,7 @@ def test_what_is_odd_about_a_file_is_told_in_a_line(
     capsys: pytest.CaptureFixture[str], series_file: Path, tmp_path: Path
 ) -> None:
     series_file.write_bytes(series_file.read_bytes() + b"more")
-    resampled = ["resample", str(series_file), "-o", "out.nii", "--quiet", "--shape", *"222"]
+    resampled = ["resample", str(series_file), "-o", "out.nii", "--quiet", "--antialias", "--shape", *"222"]
     for command in (["info", str(series_file)], resampled):
         command = [str(tmp_path / a) if a == "out.nii" else a for a in command]
         assert main([*command, "--frame", "0", "--channel", "0"]) == 0
@@ -348,7 +348,9 @@ def test_a_bare_tensor_is_saved_with_centres_at_the_integers(tmp_path: Path) -> 
     assert np.array_equal(found.affine, np.eye(4))
     save_volume(torch.rand(1, 2, 3, 4, 5), tmp_path / "b.npy")
     assert load_volume(tmp_path / "b.npy").shape == (1, 2, 3, 4, 5)
-    for wrong in (samples[0], samples.numpy()):
+    save_volume(samples.numpy(), tmp_path / "array.npy")
+    assert torch.equal(load_volume(tmp_path / "array.npy").samples, samples)
+    for wrong in (samples[0], samples.tolist()):
         with pytest.raises((ValueError, TypeError), match=r"shape|Tensor"):
             save_volume(wrong, tmp_path / "c.npy")  # type: ignore[arg-type]
     assert not (tmp_path / "c.npy").exists()
