@@ -81,7 +81,7 @@ TAKEN: dict[str, tuple[np.ndarray, Callable[[Any], Any]]] = {
     "from_grid_sample": (POINTS, lambda a: fl.from_grid_sample(a, (4, 5, 6), align_corners=False)),
     "from_zyx": (POINTS, fl.from_zyx),
     "reconstruct": (SAMPLES, lambda a: fl.reconstruct(a)(torch.from_numpy(POINTS))),
-    "resample": (SAMPLES, lambda a: fl.resample(a, shape=(3, 4, 9)).samples),
+    "resample": (SAMPLES, lambda a: fl.resample(a, shape=(3, 4, 9), antialias=True).samples),
     "Reconstruction": (SAMPLES, lambda a: Reconstruction(a)(POINTS)),
     "Reconstruction's points": (POINTS, lambda a: Reconstruction(SAMPLES).jet(a, 2)),
     "field": (POINTS, lambda a: field()(a)),

@@ -335,7 +335,7 @@ def test_a_plan_of_a_mesh_makes_none(volume_file, tmp_path, capsys):
         (["--level", "130", "-o", "a.ply", "--methd", "notch"], 1, "did you mean 'method'"),
         (["--level", "130", "-o", "a.ply", "--method", "notc"], 1, "did you mean 'notch'"),
         (["--level", "high", "-o", "a.ply"], 1, "level"),
-        (["-o", "a.ply"], 1, "add --level"),
+        (["-o", "a.ply"], 1, "a volume and --level"),
         (["--level", "999", "-o", "a.ply"], 0, "nothing crosses level 999"),
     ],
 )

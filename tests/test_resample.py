@@ -224,7 +224,7 @@ def test_mistaken_targets():
     assert resample(torch.rand(6, 6, 6), like=x).shape == (3, 4, 5)
     with pytest.raises(ValueError, match="three integers"):
         resample(x, shape=5)
-    with pytest.raises(TypeError, match=r"expected a Volume or a torch\.Tensor; got str"):
+    with pytest.raises(TypeError, match=r"expected a Volume, a torch\.Tensor or a NumPy array; got str"):
         resample(x, like="x")
 
 

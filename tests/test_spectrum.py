@@ -65,11 +65,11 @@ def test_measured_equals_closed_form(method, prefilter):
 
 def test_what_is_measured_is_the_implementation(monkeypatch):
     """A prefilter that is slightly wrong shows in the measured response and not in the closed form."""
-    from filterlab.fields import grid
+    from filterlab import ops
 
     before = spectrum.axis_response("tricubic", OMEGA)
-    right, wrong = grid.prefilter_samples, Prefilter("wrong", ((Fraction(667, 1000), Fraction(333, 2000)),))
-    monkeypatch.setattr(grid, "prefilter_samples", lambda samples, _, *rest: right(samples, wrong, *rest))
+    right, wrong = ops.prefilter_samples, Prefilter("wrong", ((Fraction(667, 1000), Fraction(333, 2000)),))
+    monkeypatch.setattr(ops, "prefilter_samples", lambda samples, _, *rest: right(samples, wrong, *rest))
     laws.assert_close(spectrum.axis_response("tricubic", OMEGA), before, 0.0)
     assert float((spectrum.measured_response("tricubic", OMEGA) - before).abs().max()) > 1e-5
 

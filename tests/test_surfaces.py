@@ -449,7 +449,12 @@ def test_bad_rays_are_refused():
         (fine[0], fine[1] * math.inf, ValueError, "directions must be finite"),
         (fine[0][:, :2], fine[1], ValueError, r"origins must have shape \(..., 3\)"),
         (fine[0], torch.ones(3, 3), ValueError, "broadcast"),
-        (fine[0].long(), fine[1], TypeError, "origins must be a floating-point torch.Tensor; got torch.int64"),
+        (
+            fine[0].long(),
+            fine[1],
+            TypeError,
+            "origins must be a floating-point torch.Tensor or NumPy array; got torch.int64",
+        ),
         ([0, 0, 0], fine[1], TypeError, "got list"),
     ):
         with pytest.raises(error, match=message):

@@ -65,8 +65,8 @@ def field_over(subject: Subject, coefficients: Tensor, first: int) -> GridField:
     built = fl.reconstruct(few, subject.method, scheme=subject.scheme, gradient=gradient, prefilter=False)
     assert isinstance(built, GridField)
     size = (coefficients.shape[2], coefficients.shape[1], coefficients.shape[0])
-    vast = replace(built.coefficients, values=coefficients, start=first, size=size, quantization=None)
-    built = built.with_coefficients(vast)
+    built.coefficients = replace(built.coefficients, values=coefficients, start=first, size=size, quantization=None)
+    built._settle()  # these lie elsewhere
     built.domain = replace(built.domain, upper=(size[0] - 0.5, size[1] - 0.5, size[2] - 0.5))
     return built
 

@@ -16,6 +16,8 @@ from filterlab.world import LPS, World
 
 sitk = pytest.importorskip("SimpleITK", reason="the extra `itk` is not installed")
 
+pytestmark = pytest.mark.filterwarnings("ignore::filterlab.resampling.AliasingWarning")  # some grids are coarser
+
 
 def turned(seed: int, scale: float = 0.2) -> np.ndarray:
     """A 4×4 matrix near a rotation about an oblique axis, with shear, and a translation."""

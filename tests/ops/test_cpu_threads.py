@@ -131,7 +131,8 @@ def test_addresses_are_only_taken_where_the_arrays_are_held() -> None:
     package = Path(filterlab.__file__).parent
     taking = re.compile(r"= *\w+(\[\w+\])?\.data_ptr\(\)|ctypes\.data\b|addressof")
     found = {p.name for p in package.rglob("*.py") if taking.search(p.read_text(encoding="utf-8"))}
-    assert found <= {"job.py", "threads.py", "prefilter.py"}  # the last one asks how memory is aligned
+    asking = {"prefilter.py", "operators.py"}  # how memory is aligned, and whether it is the same
+    assert found <= {"job.py", "threads.py"} | asking
 
 
 # --- beside torch's own threads ---------------------------------------------------------------------------------------

@@ -360,9 +360,6 @@ def test_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
         assert implementation_for(samples) == "reference"
     with pytest.raises(ValueError, match=r"'cpu' can't run here: .* got torch.int64; implementation='reference' can"):
         prefilter_axis(x.long(), 0, "cubic", implementation="cpu")
-    with monkeypatch.context() as patch:
-        patch.setattr(torch.compiler, "is_compiling", lambda: True)
-        assert implementation_for(x) == "reference"
     monkeypatch.setattr(cpu, "llvmlite_problem", lambda: "the package llvmlite can't be loaded")
     assert implementation_for(x) == "reference"
     with pytest.raises(ValueError, match="llvmlite can't be loaded"):
