@@ -14,7 +14,7 @@ _PROCESSES = 3
 def _renders(settings: Settings, tick: Tick) -> Outcome:
     """In processes of their own, with as many threads as a library has that nobody told a number."""
     number = 1 if settings.quick else _PROCESSES
-    cores, size, voxels = usable_cores(), settings.image, settings.image_voxels
+    cores, size, voxels = settings.threads, settings.image, settings.image_voxels
     found = []
     for done in range(number):
         renders = 5 if settings.quick else _RENDERS
@@ -40,7 +40,7 @@ def _renders(settings: Settings, tick: Tick) -> Outcome:
 
 
 def _items(settings: Settings) -> list[Item]:
-    return [Item("renders", 60, _renders)]
+    return [Item("renders", 60, _renders, threads=usable_cores())]
 
 
 COMPARISON = Comparison("steadiness", "whether a render takes as long every time, on all threads", _items)
