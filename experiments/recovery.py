@@ -29,6 +29,7 @@ from experiments.runs import Record
 from experiments.views import MAX_SAMPLES
 from filterlab import metrics
 from filterlab.fields.base import Domain
+from filterlab.geometry import Geometry
 from filterlab.io.config import StrictModel
 from filterlab.render.camera import Camera
 from filterlab.render.dvr import render
@@ -36,7 +37,6 @@ from filterlab.render.image import RayTensors
 from filterlab.render.transfer import TransferFunction
 from filterlab.scenes import model as scene
 from filterlab.signals import Signal
-from filterlab.volume import Geometry
 
 _POINTS = 20_000  # at which fields are compared with the signal
 _INNER = 0.9  # the share of the box, along each axis, that these points lie in

@@ -18,10 +18,12 @@ from torch import Tensor
 
 from filterlab import prefilters
 from filterlab.fields.base import Field
+from filterlab.geometry import Geometry
 from filterlab.kernels import PiecewisePolynomial, bspline
 from filterlab.labels import strongest
 from filterlab.methods import METHODS, Method, TensorProduct, Tetrahedral, checked, reconstruct
 from filterlab.missing_values import resolved
+from filterlab.notices import Notice
 from filterlab.ops.contract import Axes, Contraction, Rows
 from filterlab.ops.differentiable.contract import contract, fused
 from filterlab.ops.differentiable.recording import plain
@@ -29,7 +31,7 @@ from filterlab.ops.gather import STORAGE
 from filterlab.resampling_rows import Given, reached, rows_of
 from filterlab.shrinking import projected, smoothing
 from filterlab.sites import NEARER, Part, Sites
-from filterlab.volume import Boundary, Geometry, Volume, as_volume, exact_float
+from filterlab.volume import Boundary, Volume, as_volume, exact_float
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -40,20 +42,18 @@ SMALLEST = 1 << 16  # voxels of one
 UNTOLD = 1.25  # voxels of the old grid that a step may have before a warning
 
 
-class AliasingWarning(UserWarning):
-    """A grid is coarser than that of the samples, and nothing is said of what it does not hold.
-
-    Attributes:
-        on_command_line: what is told of it there, where the option has another name.
-    """
+class AliasingWarning(Notice):
+    """A grid is coarser than that of the samples, and nothing is said of what it does not hold."""
 
     def __init__(self, steps: float) -> None:
-        what = (
-            f"the new grid has steps of up to {steps:.3g} voxels: frequencies that it does not hold are aliased; "
-            "{} leaves them out"
+        self._what = (
+            f"the new grid has steps of up to {steps:.3g} voxels: frequencies that it does not hold are aliased"
         )
-        super().__init__(what.format("antialias=True") + ", antialias=False says that this is known")
-        self.on_command_line = what.format("--antialias")
+        super().__init__(f"{self._what}; antialias=True leaves them out, antialias=False says that this is known")
+
+    @property
+    def on_command_line(self) -> str:
+        return f"{self._what}; --antialias leaves them out"
 
 
 def resample(

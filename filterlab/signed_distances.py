@@ -22,7 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.volume import Geometry, Volume
+from filterlab.geometry import Geometry
+from filterlab.volume import Volume
 
 Triple = tuple[float, float, float]
 

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.volume import Geometry, Volume
+from filterlab.geometry import Geometry
+from filterlab.volume import Volume
 
 NEARER = 1e-9  # voxels within which two coordinates are the same: what is halfway between samples, or on the box
 ALIGNED = 1e-12  # of the largest step: less than that beside an axis is along it

@@ -20,6 +20,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 # each room may import the rooms before it (and itself); the same number: neither imports the other
 FLOORS = {
     "names": -2,
+    "notices": -2,
     "world": -2,
     "arrays": -1,
     "geometry": -1,

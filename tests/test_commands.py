@@ -207,3 +207,15 @@ def test_shrinking_is_told_of_or_antialiased(tmp_path: Path, capsys: pytest.Capt
     assert torch.equal(found, resample(volume, shape=(3, 3, 3), antialias=True).samples)
     assert main([*line, "--antialias", "--method", "nearest"]) == 2
     assert "nearest takes samples as they are" in capsys.readouterr().err
+
+
+def test_only_warnings_of_our_own_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another one keeps what is said of it elsewhere: here that it is an error."""
+    save_volume(Volume(torch.rand(4, 4, 4)), tmp_path / "in.nrrd")
+
+    def warning(*_: object, **__: object) -> None:
+        exec(compile("import warnings; warnings.warn('of torch')", "x", "exec"), {"__name__": "filterlab.resampling"})
+
+    monkeypatch.setattr("filterlab.resampling.resample", warning)
+    with pytest.raises(UserWarning, match="of torch"):
+        main(["resample", str(tmp_path / "in.nrrd"), "-o", str(tmp_path / "out.nrrd"), "--shape", *"444"])

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from filterlab.fields.base import Domain
-from filterlab.volume import Boundary, Geometry, Volume, as_volume, from_grid_sample, from_zyx
+from filterlab.geometry import Geometry
+from filterlab.volume import Boundary, Volume, as_volume, from_grid_sample, from_zyx
 from tests import laws, oracles
 
 every_boundary = pytest.mark.parametrize("boundary", Boundary)

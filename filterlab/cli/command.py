@@ -27,6 +27,7 @@ from filterlab.cli.scenes import split_overrides
 from filterlab.cli.sdf import Sdf
 from filterlab.cli.terminal import tell
 from filterlab.names import unknown_name
+from filterlab.notices import Notice
 
 DESCRIPTION = """Reconstruction filters for sampled volumes: look at scans, resample and convert them, compare methods.
 
@@ -88,13 +89,13 @@ def _warnings_told() -> Iterator[None]:
     """Tells what filterlab warns of in one line each on stderr."""
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-        if category.__module__.startswith("filterlab."):
-            tell(getattr(message, "on_command_line", str(message)))
+        if isinstance(message, Notice):
+            tell(message.on_command_line)
         else:
             usual(message, category, *where, **more)
 
     with warnings.catch_warnings():
-        warnings.filterwarnings("always", category=UserWarning, module=r"filterlab\.")
+        warnings.simplefilter("always", Notice)
         usual, warnings.showwarning = warnings.showwarning, show
         yield
 

@@ -71,8 +71,6 @@ MEMORY = {"": 1.0, "B": 1.0} | {
     for power, letter in enumerate("KMGT", start=1)
     for ending, base in (("B", 1000.0), ("iB", 1024.0))
 }
-
-
 TIME = {"": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 
 

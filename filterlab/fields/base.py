@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from filterlab.arrays import Array, as_tensor
+from filterlab.geometry import Geometry
 from filterlab.ops.pieces import Pieces
 from filterlab.ops.raycast import Candidates
 from filterlab.ops.reference import raycast
-from filterlab.volume import Geometry
 
 
 @dataclass(frozen=True)

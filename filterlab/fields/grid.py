@@ -20,6 +20,7 @@ from filterlab.arrays import Array
 from filterlab.fields.base import Domain, Field, Relevant, check_order, check_points, type_of_rays
 from filterlab.fields.ranges import ranges, straddling
 from filterlab.fields.storage import Quantization, stored_as
+from filterlab.geometry import Geometry
 from filterlab.kernels import Factor, Kernel, PiecewisePolynomial
 from filterlab.ops.differentiable import raycast as casting
 from filterlab.ops.differentiable.prefilter import implementation_for
@@ -29,7 +30,7 @@ from filterlab.ops.raycast import Candidates, Raycast
 from filterlab.ops.reference.pieces import in_cells, pieces_of_rays
 from filterlab.ops.stencil import Product, Stencil
 from filterlab.prefilters import Prefilter
-from filterlab.volume import Boundary, Geometry, Volume
+from filterlab.volume import Boundary, Volume
 
 
 @dataclass(frozen=True)

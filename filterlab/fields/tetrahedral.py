@@ -33,11 +33,12 @@ from torch import Tensor
 from filterlab import bernstein, ops
 from filterlab.bernstein import Index, multi_indices
 from filterlab.fields.grid import Coefficients, Evaluation, Term, implementation_of
+from filterlab.geometry import Geometry
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.place import Placement
 from filterlab.ops.reference.place import far_voxels
 from filterlab.ops.tetrahedra import Tetrahedra, TetrahedralStencil
-from filterlab.volume import Boundary, Geometry, all_between
+from filterlab.volume import Boundary, all_between
 
 Vector = tuple[Fraction, Fraction, Fraction]
 

@@ -486,14 +486,14 @@ def storable(path: Path, volume: Volume, types: Sequence[str], stored: str | Non
 
     Raises VolumeFileError for a batch, any other type, or samples that the type that is asked for does not hold.
     """
-    samples = volume.samples.detach().cpu()
-    if samples.dtype.is_floating_point and samples.dtype.itemsize == 2:
-        samples = samples.float()
-    name = stored or str(samples.dtype).removeprefix("torch.")
+    samples = volume.numpy()
+    if samples.dtype == np.float16:
+        samples = samples.astype(np.float32)
+    name = stored or samples.dtype.name
     if samples.ndim != 3 or name not in types:
         got = f"{volume}" if stored is None else f"{stored} for {volume}"
         raise VolumeFileError(path, f"samples (D, H, W) of a type among {', '.join(types)}", got)
-    return Outgoing.of(path, samples.contiguous().numpy(), name)
+    return Outgoing.of(path, np.ascontiguousarray(samples), name)
 
 
 def check_exact(path: Path, array: np.ndarray, dtype: np.dtype) -> None:

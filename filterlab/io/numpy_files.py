@@ -296,9 +296,7 @@ def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile
 
 
 def _samples(path: Path, volume: Volume, stored: str | None) -> Outgoing:
-    samples = volume.samples.detach().cpu().contiguous()
-    widened = samples.float() if str(samples.dtype) == "torch.bfloat16" else samples
-    return Outgoing.of(path, widened.numpy(), stored)
+    return Outgoing.of(path, np.ascontiguousarray(volume.numpy()), stored)
 
 
 def write_npy(volume: Volume, path: Path, stored: str | None = None) -> None:

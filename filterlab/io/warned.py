@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import warnings
 
+from filterlab.notices import Notice
 
-class VolumeFileWarning(UserWarning):
+
+class VolumeFileWarning(Notice):
     """Something of a volume file that is passed over; names the file and what it is."""
 
 

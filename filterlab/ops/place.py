@@ -17,7 +17,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from filterlab.volume import Boundary, Geometry
+from filterlab.geometry import Geometry
+from filterlab.volume import Boundary
 
 Placed = tuple[Tensor, Tensor | None]
 """(located, sign), both of the shape of the points; sign None where it is 1 everywhere."""

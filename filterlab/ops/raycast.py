@@ -16,9 +16,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from filterlab.geometry import Geometry
 from filterlab.ops.pieces import along_ray
 from filterlab.ops.tetrahedra import AnyLattice
-from filterlab.volume import Geometry
 
 JUMP, REPEATED = 1, 2  # bits of `Written.flags`
 

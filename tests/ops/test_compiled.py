@@ -10,13 +10,14 @@ import filterlab as fl
 from filterlab import ops
 from filterlab.fields.ncrsi import NCRSI_TERMS
 from filterlab.fields.tensor_product import Direct
+from filterlab.geometry import Geometry
 from filterlab.kernels import bspline
 from filterlab.ops import Placement, Stencil
 from filterlab.ops.differentiable import operators as compiled
 from filterlab.ops.differentiable.prefilter import prefilter_samples
 from filterlab.ops.prefilter import VOLUME, Filtering
 from filterlab.prefilters import QUADRATIC as QUADRATIC_PREFILTER
-from filterlab.volume import Boundary, Geometry
+from filterlab.volume import Boundary
 from tests.laws import assert_close
 
 QUADRATIC = Stencil.jet(bspline(2), 1)

@@ -10,9 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from filterlab.geometry import Geometry
 from filterlab.methods import reconstruct
 from filterlab.ops import Placement, place
-from filterlab.volume import Boundary, Geometry, Volume
+from filterlab.volume import Boundary, Volume
 
 SHEARED = torch.tensor([[1, 0.2, 0, 3], [0, -1, 0.1, 2], [0.3, 0, 2, 1], [0, 0, 0, 1]], dtype=torch.float64)
 GEOMETRIES = {

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from filterlab.fields.base import Domain
+from filterlab.geometry import Geometry
 from filterlab.render import OrthographicCamera, PerspectiveCamera
-from filterlab.volume import Geometry
 
 PERSPECTIVE = PerspectiveCamera(position=(1.0, -4.0, 2.0), target=(0.2, 0.1, -0.3), field_of_view=40.0)
 ORTHOGRAPHIC = OrthographicCamera(position=(1.0, -4.0, 2.0), target=(0.2, 0.1, -0.3), height=3.0)

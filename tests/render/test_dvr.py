@@ -11,10 +11,11 @@ from scipy.integrate import quad
 from filterlab import signals
 from filterlab.fields.base import Domain, Field
 from filterlab.fields.grid import GridField
+from filterlab.geometry import Geometry
 from filterlab.methods import reconstruct
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.rays import intersect, jitter
-from filterlab.volume import Geometry, Volume
+from filterlab.volume import Volume
 
 GREY = [[0.5, 0.5, 0.5]]
 BOX = Domain((-0.5, -0.5, -0.5), (7.5, 5.5, 9.5), Geometry.of((0.5, 1.0, 0.75), (1.0, 2.0, 3.0)), 0.5)

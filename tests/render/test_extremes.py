@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from filterlab.fields.base import Domain, Field
+from filterlab.geometry import Geometry
 from filterlab.methods import reconstruct
 from filterlab.ops.reference.optics import absorbed
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.render.rays import jitter
-from filterlab.volume import Geometry, Volume
+from filterlab.volume import Volume
 
 SCHEMES = ("direct", "fused")
 EPS = {torch.float32: 2.0**-23, torch.float64: 2.0**-52}

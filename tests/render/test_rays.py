@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from filterlab.fields.base import Domain
+from filterlab.geometry import Geometry
 from filterlab.ops.reference.march import segments
 from filterlab.render.rays import check_rays, check_region, intersect, jitter, segment_count
-from filterlab.volume import Geometry
 
 UNIT = Domain((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 

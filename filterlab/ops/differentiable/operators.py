@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.library import custom_op
 
+from filterlab.geometry import Geometry
 from filterlab.kernels import Kernel
 from filterlab.ops.differentiable import gather as sums
 from filterlab.ops.differentiable import place as placement
@@ -27,7 +28,7 @@ from filterlab.ops.stencil import Product, Stencil
 from filterlab.ops.tetrahedra import AnyStencil, Tetrahedra, TetrahedralStencil
 from filterlab.ops.tracing import constant
 from filterlab.prefilters import Prefilter, named
-from filterlab.volume import Boundary, Geometry
+from filterlab.volume import Boundary
 
 
 @constant

@@ -7,8 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+from filterlab.geometry import Geometry
 from filterlab.ops.place import Placement
-from filterlab.volume import Geometry, all_between
+from filterlab.volume import all_between
 
 
 def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
