@@ -638,6 +638,8 @@ def test_mistakes_about_levels_are_named(capsys: pytest.CaptureFixture[str], vol
     fails(capsys, ["render", volume_file, "--level", "1", "--step", "1", "-o", out], 1, "hit exactly")
     fails(capsys, ["render", volume_file, "--level", "1", "--surface.material", "tooon", "-o", out], 1, "'toon'")
     assert not out.exists()
+    volume_file.write_bytes(volume_file.read_bytes()[:-4])  # no voxel is read to say so
+    fails(capsys, ["mesh", volume_file, "-o", out.with_suffix(".ply")], 1, "a volume and --level; got neither")
 
 
 def test_render_refuses_before_it_works(

@@ -60,9 +60,7 @@ class Mesh:
         from filterlab.scenes.plan_report import table
         from filterlab.surfaces.meshes import mesh
 
-        scene = scene_asked_for(self.scene, overrides, self.output)
-        if scene.surface is None:
-            raise ValueError(f"expected a scene with a surface, or a volume and --level; got neither: {self.scene}")
+        scene = scene_asked_for(self.scene, overrides, self.output, of_surface=True)
         with progress_bar(self.quiet) as progress, reading(progress):
             prepared = build(scene)
         assert isinstance(prepared, PreparedSurface)

@@ -15,8 +15,11 @@ if TYPE_CHECKING:
     from filterlab.scenes.model import Scene
 
 
-def scene_asked_for(path: Path, overrides: dict[str, str], output: Path | None) -> Scene:
-    """The scene in a file; or of a volume, as overrides ask, its surface, greatest values or slice, else as it is."""
+def scene_asked_for(path: Path, overrides: dict[str, str], output: Path | None, *, of_surface: bool = False) -> Scene:
+    """The scene in a file; or of a volume, as overrides ask, its surface, greatest values or slice, else as it is.
+
+    Raises ValueError for one without a surface where it has to be `of_surface`, of a volume before that is read.
+    """
     from filterlab.scenes.build import load_scene, surface_scene, values_scene
     from filterlab.scenes.default import default_scene
 
@@ -30,7 +33,9 @@ def scene_asked_for(path: Path, overrides: dict[str, str], output: Path | None) 
     elif {name.partition(".")[0] for name in chosen} & {"mip", "slice"}:
         scene = values_scene(path, chosen)
     else:
-        scene = default_scene(path, chosen)
+        scene = None if of_surface else default_scene(path, chosen)
+    if scene is None or (of_surface and scene.surface is None):
+        raise ValueError(f"expected a scene with a surface, or a volume and --level; got neither: {path}")
     if scene.volume is not None and output is not None:
         check_not_input(output, Path(scene.volume.file))
     check_device(scene.device)
