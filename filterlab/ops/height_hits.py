@@ -23,7 +23,7 @@ box around all heights, with d so long that its largest component is 1.
 | beyond the grid | nothing |
 
 All of it is float64, whatever the type of rays and heights. Bounds are float32, rounded outwards, and wider than that
-by what rounding may do to coefficients: `SLACK` of the largest one.
+by what rounding may do to coefficients.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -44,7 +45,9 @@ POINTS = (DEGREE + 1) ** 2
 """Domain points of a cell, number 5 t + s at (s/4, t/4): n of the upper triangle is 24 − n of the lower one."""
 
 SLACK = 2.0**-44
-"""Of the largest coefficient, by what bounds are wider."""
+"""Of the largest height that the data could make, by what bounds are wider."""
+
+ROUNDING, SMALLEST = 2.0**-23, 2.0**-149  # of numbers that become float32
 
 Weights = tuple[tuple[int, float], ...]
 """Numbers of data in a window, and their weights."""
@@ -76,6 +79,11 @@ class Cell:
         size = before + after + 1
         known = dict(_masks(pattern.down, before, size, down=True)) | dict(_masks(pattern.up, before, size, down=False))
         return cls(pattern.steps, before, size, tuple(known[n] for n in range(POINTS)), pattern.mirrored)
+
+    @property
+    def norm(self) -> float:
+        """No coefficient is larger than this times the largest datum."""
+        return max(sum(abs(weight) for _, weight in mask) for mask in self.masks)
 
     @property
     def finest(self) -> int:
@@ -114,11 +122,8 @@ class Pyramid:
 
     @cached_property
     def starts(self) -> tuple[int, ...]:
-        """Where every level begins."""
-        starts = [0]
-        for rows, columns in self.sizes:
-            starts.append(starts[-1] + rows * columns)
-        return tuple(starts[:-1])
+        """Where every level begins, and where the last one ends."""
+        return (0, *accumulate(rows * columns for rows, columns in self.sizes))
 
     @cached_property
     def range(self) -> tuple[float, float]:
@@ -126,35 +131,44 @@ class Pyramid:
         low, high = self.numbers[-1].tolist()
         return low, high
 
+    def level(self, number: int) -> Tensor:
+        """(rows, columns, 2) of blocks, the smallest ones first; written to, it changes."""
+        return self.numbers[self.starts[number] : self.starts[number + 1]].unflatten(0, self.sizes[number])
 
-def widened(bounds: Tensor) -> Tensor:
-    """(..., 2) float64 bounds of blocks as float32, wider."""
-    finite = bounds[bounds.isfinite()]
-    slack = SLACK * float(finite.abs().max()) if len(finite) else 0.0
-    wide = torch.stack((bounds[..., 0] - slack, bounds[..., 1] + slack), -1)
-    near = wide.float()
-    ends = torch.tensor([-torch.inf, torch.inf], device=near.device)
-    off = torch.stack((near[..., 0] > wide[..., 0], near[..., 1] < wide[..., 1]), -1)
-    return torch.where(off, near.nextafter(ends), near)
+    @classmethod
+    def room(cls, heights: Heights, finest: int) -> Pyramid:
+        """To be written: the first level, then `complete`."""
+        columns, rows = heights.cells
+        sizes = [(-(-rows // (1 << finest)), -(-columns // (1 << finest)))]
+        while max(sizes[-1]) > 1:
+            sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
+        count = sum(r * c for r, c in sizes)
+        return cls(torch.empty(count, 2, device=heights.values.device), tuple(sizes), finest)
+
+    def complete(self) -> Pyramid:
+        """The same, with all levels made from the first."""
+        for number in range(1, len(self.sizes)):
+            enclose(self.level(number - 1), 2, self.level(number))
+        return self
 
 
-def above(level: Tensor) -> Tensor:
-    """Bounds of 2 × 2 blocks each, fewer at the ends, of those of blocks (rows, columns, 2)."""
-    pad = (0, level.shape[1] % 2, 0, level.shape[0] % 2)
-    low, high = (
-        torch.nn.functional.pad(own, pad, value=none).unflatten(1, (-1, 2)).unflatten(0, (-1, 2))
-        for own, none in zip(level.unbind(-1), (torch.inf, -torch.inf), strict=True)
-    )
-    return torch.stack((low.amin((1, 3)), high.amax((1, 3))), -1)
+def enclose(bounds: Tensor, edge: int, out: Tensor) -> None:
+    """Write those of edge × edge blocks each, fewer at the ends, of bounds (rows, columns, 2) of single ones."""
+    out[..., 0], out[..., 1] = torch.inf, -torch.inf
+    for part in (bounds[y::edge, x::edge] for y in range(edge) for x in range(edge)):
+        low, high = out[: part.shape[0], : part.shape[1]].unbind(-1)
+        torch.minimum(low, part[..., 0], out=low)
+        torch.maximum(high, part[..., 1], out=high)
 
 
-def pyramid_of(level: Tensor, finest: int) -> Pyramid:
-    """From bounds (rows, columns, 2) float64 of the smallest blocks."""
-    levels = [widened(level)]
-    while len(levels[-1].flatten(0, 1)) > 1:
-        levels.append(above(levels[-1]))
-    sizes = tuple((own.shape[0], own.shape[1]) for own in levels)
-    return Pyramid(torch.cat([own.flatten(0, 1) for own in levels]), sizes, finest)
+def slack_of(heights: Heights, cell: Cell) -> float:
+    """By what bounds are wider than coefficients, for rounding."""
+    values = heights.values.detach()
+    if values.dtype.is_floating_point:
+        least, most = (values.nan_to_num(nan=0.0) if bool(values.isnan().any()) else values).aminmax()
+    else:
+        least, most = values.aminmax()
+    return SLACK * cell.norm * max(abs(float(least)), abs(float(most)))
 
 
 @dataclass(frozen=True, eq=False)

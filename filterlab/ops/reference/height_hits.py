@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from filterlab import bernstein
-from filterlab.ops.height_hits import DEGREE, Cell, HeightHits, Pyramid, above, pyramid_of
+from filterlab.ops.height_hits import DEGREE, ROUNDING, SMALLEST, Cell, HeightHits, Pyramid, enclose, slack_of
 from filterlab.ops.heights import Heights
 from filterlab.ops.raycast import Candidates, joined
 from filterlab.ops.reference.heights import patches
@@ -210,7 +210,7 @@ def _way_out(lines: Lines, at: _Places) -> tuple[Tensor, Tensor]:
 def _relevant(pyramid: Pyramid, lines: Lines, at: _Places, out: Tensor) -> Tensor:
     """(Q,) whether lines may meet something in their blocks."""
     level = (at.level - pyramid.finest).clamp_min(0)
-    starts, widths = torch.tensor([pyramid.starts, [w for _, w in pyramid.sizes]], device=level.device)
+    starts, widths = torch.tensor([pyramid.starts[:-1], [w for _, w in pyramid.sizes]], device=level.device)
     shift = level + pyramid.finest
     low, high = pyramid.numbers[starts[level] + (at.y >> shift) * widths[level] + (at.x >> shift)].double().unbind(-1)
     a, b = (lines.origins[:, 2] + s * lines.directions[:, 2] for s in (at.s, out))
@@ -309,15 +309,14 @@ def _barycentric(place: Tensor, upper: Tensor) -> Tensor:
 def pyramid(heights: Heights, cell: Cell) -> Pyramid:
     """Of the spline over one grid."""
     (columns, rows), edge = heights.cells, 1 << cell.finest
+    found, slack = Pyramid.room(heights, cell.finest), slack_of(heights, cell)
     step = edge * max(1, _CELLS_AT_ONCE // (edge * columns))
-    parts = []
-    for first_ in range(0, rows, step):
-        y, x = torch.meshgrid(torch.arange(first_, min(first_ + step, rows)), torch.arange(columns), indexing="ij")
-        level = _bounds(patches(heights, torch.stack((x, y), -1).flatten(0, 1), torch.float64)[0]).unflatten(0, x.shape)
-        for _ in range(cell.finest):
-            level = above(level)
-        parts.append(level)
-    return pyramid_of(torch.cat(parts), cell.finest)
+    for begin in range(0, rows, step):
+        y, x = torch.meshgrid(torch.arange(begin, min(begin + step, rows)), torch.arange(columns), indexing="ij")
+        cells = torch.stack((x, y), -1).flatten(0, 1).to(heights.values.device)
+        level = _widened(_bounds(patches(heights, cells, torch.float64)[0]), slack).unflatten(0, x.shape)
+        enclose(level, edge, found.level(0)[begin // edge : -(-(begin + step) // edge)])
+    return found.complete()
 
 
 def _bounds(coefficients: Tensor) -> Tensor:
@@ -325,3 +324,10 @@ def _bounds(coefficients: Tensor) -> Tensor:
     hole = coefficients.isfinite().all(-1, keepdim=True).logical_not()
     low, high = (torch.where(hole, none, coefficients) for none in (math.inf, -math.inf))
     return torch.stack((low.amin((1, 2)), high.amax((1, 2))), -1)
+
+
+def _widened(bounds: Tensor, slack: float) -> Tensor:
+    """float32, however it is rounded; ∞ stays."""
+    more = slack + ROUNDING * bounds.abs() + SMALLEST
+    wide = bounds + torch.stack((-more[..., 0], more[..., 1]), -1)
+    return torch.where(bounds.isfinite(), wide, bounds).float()
