@@ -32,6 +32,7 @@ from filterlab.ops import heights as described
 from filterlab.ops.reference import heights as reference
 from filterlab.surfaces.base import Hits, Surface
 from filterlab.surfaces.quartic import quartic_spline
+from filterlab.surfaces.relief import Relief
 from filterlab.volume import Boundary
 
 _CELLS_AT_ONCE = 1 << 16
@@ -107,6 +108,22 @@ class HeightField(Surface):
         points = self._checked_points(points)
         check_order(order, self.max_order)
         return self._implicit(points, order) if points.shape[-1] == 3 else self._explicit(points, order)
+
+    def relief(self, points: Array, order: int = 2) -> Relief:
+        """Slope, aspect and curvatures anywhere: `Relief` says what, and in which units.
+
+        Args:
+            points: as for `jet`, (*P, 2).
+            order: 1 for slope and aspect, 2 for curvatures too.
+
+        x must go to the east and y to the north, in the unit of the heights. Differentiable and raises as `jet`.
+        """
+        if order not in (1, 2):
+            raise ValueError(f"order must be 1 or 2; got {order!r}")
+        points = self._checked_points(points)
+        if points.shape[-1] != 2:
+            raise ValueError(f"points must have shape (..., 2): x, y; got {tuple(points.shape)}")
+        return Relief(*self._explicit(points, order))
 
     def _explicit(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         n = self.heights.shape[0] if self.batched else 1
