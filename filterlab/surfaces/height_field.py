@@ -38,6 +38,7 @@ from filterlab.surfaces.base import Hits, Surface, check_rays
 from filterlab.surfaces.level_set import RAYS_AT_ONCE
 from filterlab.surfaces.sheets import sheets_of
 from filterlab.surfaces.quartic import quartic_spline
+from filterlab.surfaces.relief import Relief
 from filterlab.volume import Boundary
 
 class HeightField(Surface):
@@ -111,6 +112,22 @@ class HeightField(Surface):
         points = self._checked_points(points)
         check_order(order, self.max_order)
         return self._implicit(points, order) if points.shape[-1] == 3 else self._explicit(points, order)
+
+    def relief(self, points: Array, order: int = 2) -> Relief:
+        """Slope, aspect and curvatures anywhere: `Relief` says what, and in which units.
+
+        Args:
+            points: as for `jet`, (*P, 2).
+            order: 1 for slope and aspect, 2 for curvatures too.
+
+        x must go to the east and y to the north, in the unit of the heights. Differentiable and raises as `jet`.
+        """
+        if order not in (1, 2):
+            raise ValueError(f"order must be 1 or 2; got {order!r}")
+        points = self._checked_points(points)
+        if points.shape[-1] != 2:
+            raise ValueError(f"points must have shape (..., 2): x, y; got {tuple(points.shape)}")
+        return Relief(*self._explicit(points, order))
 
     def _explicit(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         n = self.heights.shape[0] if self.batched else 1
