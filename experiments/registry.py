@@ -39,6 +39,8 @@ _NAMES = (
     "partitions",
     "prefilters_on_tetrahedra",
     "tetrahedral_table",
+    "terrain_roots",
+    "terrain_frames",
     "demo",
 )
 
