@@ -1,7 +1,8 @@
 """Surfaces: what a ray can hit, exactly.
 
     Field ────────────▶ LevelSet ──hit(rays)──▶ Hits ──at(rays, hits)──▶ points, normals, curvatures
-    A, b, c in bounds ▶ Quadrics ──────┘
+    A, b, c in bounds ▶ Quadrics ──────┤
+    heights on a grid ▶ HeightField ───┘
                         LevelSet ──mesh(…)────▶ triangles
 
 Every surface finds its hits in its own way; derivatives of a hit, and what is known of the surface there, are written
@@ -10,12 +11,14 @@ once (`surfaces.base`).
 
 from filterlab.surfaces.base import Hits, Surface, SurfacePoints
 from filterlab.surfaces.bounds import Bounds, Planes, Spheres, Tetrahedra
+from filterlab.surfaces.height_field import HeightField
 from filterlab.surfaces.level_set import LevelSet
 from filterlab.surfaces.meshes import Mesh, mesh
 from filterlab.surfaces.quadrics import Quadrics
 
 __all__ = [
     "Bounds",
+    "HeightField",
     "Hits",
     "LevelSet",
     "Mesh",
