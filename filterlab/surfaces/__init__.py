@@ -15,6 +15,7 @@ from filterlab.surfaces.height_field import HeightField
 from filterlab.surfaces.level_set import LevelSet
 from filterlab.surfaces.meshes import Mesh, mesh
 from filterlab.surfaces.quadrics import Quadrics
+from filterlab.surfaces.relief import Relief
 
 __all__ = [
     "Bounds",
@@ -24,6 +25,7 @@ __all__ = [
     "Mesh",
     "Planes",
     "Quadrics",
+    "Relief",
     "Spheres",
     "Surface",
     "SurfacePoints",
