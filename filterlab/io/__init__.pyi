@@ -2,6 +2,7 @@ from .affines import CONVENTIONS, load_affine
 from .atomic import atomic_write
 from .bounded import VolumeFileError, VolumeHeader
 from .config import ConfigError, StrictModel, dump_config, load_config
+from .covers import is_slim, load_slim, save_slim
 from .images import load_image, save_animation, save_image
 from .meshes import MESH_FORMATS, load_mesh, save_mesh
 from .volumes import FORMATS, describe, load_volume, save_volume
@@ -17,13 +18,16 @@ __all__ = [
     "atomic_write",
     "describe",
     "dump_config",
+    "is_slim",
     "load_affine",
     "load_config",
     "load_image",
     "load_mesh",
+    "load_slim",
     "load_volume",
     "save_animation",
     "save_image",
     "save_mesh",
+    "save_slim",
     "save_volume",
 ]

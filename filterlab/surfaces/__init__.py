@@ -1,7 +1,8 @@
 """Surfaces: what a ray can hit, exactly.
 
     Field ────────────▶ LevelSet ──hit(rays)──▶ Hits ──at(rays, hits)──▶ points, normals, curvatures
-    A, b, c in bounds ▶ Quadrics ──────┘
+    A, b, c in bounds ▶ Quadrics ──────┤
+    … in balls        ▶ Slim ──────────┘   blended
                         LevelSet ──mesh(…)────▶ triangles
 
 Every surface finds its hits in its own way; derivatives of a hit, and what is known of the surface there, are written
@@ -13,6 +14,7 @@ from filterlab.surfaces.bounds import Bounds, Planes, Spheres, Tetrahedra
 from filterlab.surfaces.level_set import LevelSet
 from filterlab.surfaces.meshes import Mesh, mesh
 from filterlab.surfaces.quadrics import Quadrics
+from filterlab.surfaces.slim import Slim
 
 __all__ = [
     "Bounds",
@@ -21,6 +23,7 @@ __all__ = [
     "Mesh",
     "Planes",
     "Quadrics",
+    "Slim",
     "Spheres",
     "Surface",
     "SurfacePoints",

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Domain
-from filterlab.ops import quadrics as described
+from filterlab.ops import quadrics as description
 from filterlab.ops.differentiable import quadrics as ops
 from filterlab.surfaces import quadric_kinds as kinds
 from filterlab.surfaces.base import Hits, Surface
@@ -72,8 +72,8 @@ class Quadrics(Surface):
     ) -> None:
         if not isinstance(bounds, Bounds):
             raise TypeError(f"bounds must be Spheres, Tetrahedra or Planes; got {type(bounds).__name__}")
-        if faces not in described.FACES:
-            raise ValueError(f"faces must be one of {', '.join(described.FACES)}; got {faces!r}")
+        if faces not in description.FACES:
+            raise ValueError(f"faces must be one of {', '.join(description.FACES)}; got {faces!r}")
         count = len(bounds)
         self.A, self.b = check_rows("A", A, (count, 3, 3)), check_rows("b", b, (count, 3))
         self.c = check_rows("c", c, (count,))
@@ -81,7 +81,7 @@ class Quadrics(Surface):
         self.bounds, self.faces = bounds if cuts is None else bounds.cut(cuts), faces
         self._check()
         self.domain = _domain(self.bounds)
-        self._built: tuple[tuple[int, ...], described.Quadrics] | None = None
+        self._built: tuple[tuple[int, ...], description.Quadrics] | None = None
 
     def _check(self) -> None:
         if not len(self):
@@ -202,32 +202,32 @@ class Quadrics(Surface):
     @property
     def detached(self) -> Quadrics:
         other = self.with_tensors([x.detach() for x in self.tensors])
-        other._built = tuple(x._version for x in other.tensors), self._cast
+        other._built = tuple(x._version for x in other.tensors), self.described
         return other
 
     def _first(self, origins: Tensor, directions: Tensor) -> Hits:
-        t, piece = ops.hits(self._cast, origins.reshape(-1, 3), directions.reshape(-1, 3), 1)
+        t, piece = ops.hits(self.described, origins.reshape(-1, 3), directions.reshape(-1, 3), 1)
         return Hits(t[:, 0], piece[:, 0])
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        return Hits(*ops.hits(self._cast, origins, directions, sheets, farthest))
+        return Hits(*ops.hits(self.described, origins, directions, sheets, farthest))
 
     # --- what is cast ---
 
     @property
-    def _cast(self) -> described.Quadrics:
+    def described(self) -> description.Quadrics:
         """The index and the numbers in it, as they are now."""
         versions = tuple(x._version for x in self.tensors)
         if self._built is None or self._built[0] != versions:
             self._built = versions, self._described()
         return self._built[1]
 
-    def _described(self) -> described.Quadrics:
+    def _described(self) -> description.Quadrics:
         bounds, (lower, upper) = self.bounds, self.bounds.boxes.around()
         slack = _ROUNDINGS * torch.finfo(torch.float64).eps * torch.maximum(lower.abs(), upper.abs()).amax()
         planes = bounds.planes.clone()
         planes[..., 3] += (planes[..., :3] * bounds.centers[:, None]).sum(-1) - slack
-        return described.Quadrics.of(
+        return description.Quadrics.of(
             bounds.boxes, self._about_centers(), bounds.centers, bounds.radii + slack, planes, self.faces
         )
 
@@ -250,7 +250,7 @@ class Quadrics(Surface):
         """
         if self.faces == "both":
             return self
-        found = self._cast.some(self._facing(eye.detach().to(self.bounds.centers)))
+        found = self.described.some(self._facing(eye.detach().to(self.bounds.centers)))
         other = copy.copy(self)
         other._built = tuple(x._version for x in self.tensors), found
         return other
