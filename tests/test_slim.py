@@ -139,7 +139,7 @@ def test_the_last_sheets_are_the_first_ones_from_behind(either):
 
 
 def test_balls_at_one_place_and_hits_at_their_ends(either):
-    cover = [x[:1].repeat(40, *[1] * (x.ndim - 1)) for x in torus(200)]
+    cover = [x[:1].repeat(600, *[1] * (x.ndim - 1)) for x in torus(200)]
     one = Slim(*(x[:1] for x in cover))
     origins = cover[0][:1] + torch.tensor([[2.0, 0.01, 0.02]])
     direction = torch.tensor([-1.0, 0, 0], dtype=F64)
