@@ -3,7 +3,8 @@
     Field ────────────▶ LevelSet ──hit(rays)──▶ Hits ──at(rays, hits)──▶ points, normals, curvatures
     A, b, c in bounds ▶ Quadrics ──────┤
     corners ──▶ BilinearQuads ─────────┤
-    heights on a grid ▶ HeightField ───┘
+    heights on a grid ▶ HeightField ───┤
+    … in balls        ▶ Slim ──────────┘   blended
                         LevelSet ──mesh(…)────▶ triangles
 
 Every surface finds its hits in its own way; derivatives of a hit, and what is known of the surface there, are written
@@ -18,6 +19,7 @@ from filterlab.surfaces.level_set import LevelSet
 from filterlab.surfaces.meshes import Mesh, mesh
 from filterlab.surfaces.quadrics import Quadrics
 from filterlab.surfaces.relief import Relief
+from filterlab.surfaces.slim import Slim
 
 __all__ = [
     "BilinearQuads",
@@ -29,6 +31,7 @@ __all__ = [
     "Planes",
     "Quadrics",
     "Relief",
+    "Slim",
     "Spheres",
     "Surface",
     "SurfacePoints",
