@@ -29,6 +29,7 @@ from filterlab.fields.base import Domain, check_order
 from filterlab.missing_values import filled
 from filterlab.names import NAN_CHOICES
 from filterlab.ops import heights as described
+from filterlab.ops.differentiable import heights as ops
 from filterlab.ops.reference import heights as reference
 from filterlab.surfaces.base import Hits, Surface
 from filterlab.surfaces.quartic import quartic_spline
@@ -127,7 +128,7 @@ class HeightField(Surface):
 
     def _explicit(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         n = self.heights.shape[0] if self.batched else 1
-        rows = reference.jet(self._described, points.reshape(n, -1, 2), order)
+        rows = ops.jet(self._described, points.reshape(n, -1, 2), order)
         z, *slopes = (row.reshape(points.shape[:-1]) for row in rows.unbind(1))
         if order == 0:
             return (z,)
