@@ -18,8 +18,10 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from numbers import Real
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,15 +30,17 @@ from filterlab.arrays import Array, as_tensor
 from filterlab.fields.base import Domain, check_order
 from filterlab.missing_values import filled
 from filterlab.names import NAN_CHOICES
+from filterlab.ops import height_hits
 from filterlab.ops import heights as described
-from filterlab.ops.differentiable import heights as ops
+from filterlab.ops.differentiable import height_hits as ops
+from filterlab.ops.differentiable import heights as jets
 from filterlab.ops.reference import heights as reference
-from filterlab.surfaces.base import Hits, Surface
+from filterlab.surfaces.base import Hits, Surface, check_rays
+from filterlab.surfaces.level_set import RAYS_AT_ONCE
 from filterlab.surfaces.quartic import quartic_spline
 from filterlab.surfaces.relief import Relief
+from filterlab.surfaces.sheets import sheets_of
 from filterlab.volume import Boundary
-
-_CELLS_AT_ONCE = 1 << 16
 
 
 class HeightField(Surface):
@@ -83,6 +87,7 @@ class HeightField(Surface):
         self.boundary, self.diagonal = Boundary.named(boundary), diagonal
         self.spacing, self.origin = _checked_spacing(spacing), _pair("origin", origin)
         self.heights = _resolved(_checked_heights(heights), nan)
+        self._kept: dict[str, Any] = {}  # what is cast, and of which version of the heights
 
     def __repr__(self) -> str:
         rows, columns = self.heights.shape[-2:]
@@ -128,7 +133,7 @@ class HeightField(Surface):
 
     def _explicit(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         n = self.heights.shape[0] if self.batched else 1
-        rows = ops.jet(self._described, points.reshape(n, -1, 2), order)
+        rows = jets.jet(self._described, points.reshape(n, -1, 2), order)
         z, *slopes = (row.reshape(points.shape[:-1]) for row in rows.unbind(1))
         if order == 0:
             return (z,)
@@ -200,30 +205,9 @@ class HeightField(Surface):
             sorted((o, o + d * max(n - 1, 1)))
             for o, d, n in zip(self.origin, self.spacing, self.heights.shape[:-3:-1], strict=True)
         )
-        low, high = self._range
+        lows, highs = zip(*(cast.pyramid.range for cast in self._casts), strict=True)
+        low, high = (min(lows), max(highs)) if min(lows) <= max(highs) else (0.0, 0.0)
         return Domain((x[0], y[0], low), (x[1], y[1], high), voxel_size=min(map(abs, self.spacing)))
-
-    @property
-    def _range(self) -> tuple[float, float]:
-        """Least and largest coefficient of all patches that are no holes; (0, 0) where all are."""
-        version = self.heights._version
-        if self._known_range is None or self._known_range[0] != version:
-            self._known_range = version, self._searched_range()
-        return self._known_range[1]
-
-    _known_range: tuple[int, tuple[float, float]] | None = None
-
-    def _searched_range(self) -> tuple[float, float]:
-        columns, rows = self.cells
-        low, high = math.inf, -math.inf
-        for begin in range(0, columns * rows, _CELLS_AT_ONCE):
-            number = torch.arange(begin, min(begin + _CELLS_AT_ONCE, columns * rows), device=self.heights.device)
-            found = self.detached.patches(torch.stack((number % columns, number // columns), -1))
-            known = found[~found.isnan()]
-            if known.numel():
-                least, most = known.aminmax()
-                low, high = min(low, float(least)), max(high, float(most))
-        return (low, high) if low <= high else (0.0, 0.0)
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
@@ -232,7 +216,7 @@ class HeightField(Surface):
     def with_tensors(self, tensors: Sequence[Tensor]) -> HeightField:
         other = copy.copy(self)
         (other.heights,) = tensors
-        other._known_range = None
+        other._kept = {}
         return other
 
     @property
@@ -246,10 +230,37 @@ class HeightField(Surface):
         return other
 
     def _first(self, origins: Tensor, directions: Tensor) -> Hits:
-        raise NotImplementedError
+        return Hits(ops.first(self._cast, origins.reshape(-1, 3), directions.reshape(-1, 3)))
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        raise NotImplementedError
+        parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
+        return Hits(torch.cat([self._sheets_of_part(o, d, sheets, farthest) for o, d in parts]))
+
+    def _sheets_of_part(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
+        found = ops.candidates(self._cast, origins, directions)
+        extent = self.domain.diagonal / directions.abs().amax(-1).double()
+        return sheets_of(found, extent, sheets, farthest)
+
+    def met(self, origins: Array, directions: Array) -> Tensor:
+        origins, directions = check_rays(origins, directions)
+        o, d = (x.detach().reshape(-1, 3) for x in (origins, directions))
+        return ops.met(self._cast, o, d).reshape(origins.shape[:-1])
+
+    @property
+    def _cast(self) -> height_hits.HeightHits:
+        """The heights as they are now, and bounds of blocks of them."""
+        if self.batched:
+            raise ValueError(f"rays are cast at one grid; got {len(self.heights)}: make a HeightField of each")
+        return self._casts[0]
+
+    @property
+    def _casts(self) -> list[height_hits.HeightHits]:
+        """Of every grid; made again when heights were changed in place."""
+        given, version = self._described, self.heights._version
+        if self._kept.get("version") != version:
+            grids = [replace(given, values=grid.detach()[None]) for grid in given.values]
+            self._kept.update(version=version, casts=[ops.described(grid) for grid in grids])
+        return self._kept["casts"]
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
