@@ -380,7 +380,7 @@ def check_rays(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     origins, directions = as_tensor(origins), as_tensor(directions)
     rays = _broadcast(origins, directions)
     for name, x in (("origins", origins), ("directions", directions)):
-        if not _all_finite(x.detach()):
+        if not all_finite(x.detach()):
             wrong = int((~x.detach().isfinite()).any(-1).sum())
             raise ValueError(f"{name} must be finite; {wrong} rays are not")
     some_zero = int(directions.detach().count_nonzero()) < directions.numel()
@@ -409,8 +409,8 @@ def _broadcast(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     return o, d
 
 
-def _all_finite(x: Tensor) -> bool:
-    """A finite sum has finite terms; finite terms may have another one."""
+def all_finite(x: Tensor) -> bool:
+    """Whether all numbers are: a finite sum has finite terms; finite terms may have another one."""
     return math.isfinite(float(x.sum())) or bool(x.isfinite().all())
 
 
