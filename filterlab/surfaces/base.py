@@ -33,6 +33,7 @@ MAX_SHEETS = 4096
 _STEPS = 2  # of Newton's method: derivatives up to the second
 _FAR = 64  # diameters of the domain from which on o + t d is polished
 _BESIDE = 1e-3  # voxels from a hit, along its ray, to where derivatives are looked for that are none at it
+_LIFT = 1e-3  # voxels by which a ray to a light begins in front of the surface
 _POLISH = 1e-3  # of a voxel, by at most: rays that are nearly tangents turn the rounding of o + t d into long ways
 
 
@@ -186,6 +187,10 @@ class Surface(ABC):
         o, d = (x.detach().reshape(-1, 3) for x in (origins, directions))
         found = self.detached._sheets(o, d, sheets, farthest).of_rays((*origins.shape[:-1], sheets), origins.dtype)
         return self._attached(found, origins[..., None, :], directions[..., None, :])
+
+    def clearance(self, hit: Hits) -> Tensor:
+        """How far off a hit (...) a ray to a light begins, in world units."""
+        return torch.full_like(hit.t.detach(), _LIFT * self.domain.voxel_size)
 
     def at(self, origins: Array, directions: Array, hit: Hits, order: int = 1) -> SurfacePoints:
         """What is known of the surface at hits.

@@ -41,6 +41,7 @@ from filterlab.surfaces.bounds import Spheres, check_rows
 from filterlab.surfaces.quadrics import Quadrics
 
 _T, _ENDS, _NORMAL = 0, slice(1, 3), slice(3, 6)  # of `Hits.blend`: t, begin and end (`ops.slim`), Σ w n
+_LIFTS = {"front": 1e-3, "back": 0.03, "both": 0.03}
 _SIDES = {"front": ("front",), "back": ("back",), "both": ("front", "back")}
 FACES = tuple(_SIDES)
 
@@ -90,7 +91,8 @@ class Slim(Surface):
             raise ValueError(f"offset must be a number from 0 on, of a ball's radius; got {offset!r}")
         self.centers, self.radii = check_rows("centers", centers, (None, 3)), radii
         check_rows("radii", radii, (len(centers),))
-        self.A, self.b, self.c, self.cuts = A, b, c, cuts
+        self.A, self.b = check_rows("A", A, (len(centers), 3, 3)), check_rows("b", b, (len(centers), 3))
+        self.c, self.cuts = check_rows("c", c, (len(centers),)), cuts
         self.offset, self.faces = float(offset), faces
         self._built: _Built | None = None
         self._now()
@@ -149,6 +151,11 @@ class Slim(Surface):
             t, piece = t.gather(1, order), piece.gather(1, order)
             blend = blend.gather(1, order[..., None].expand(-1, -1, blend.shape[-1]))
         return Hits(t, piece, blend)
+
+    def clearance(self, hit: Hits) -> Tensor:
+        """A part of the ball's radius: where backs count, what a hit is blended of has to be behind it."""
+        assert hit.piece is not None
+        return _LIFTS[self.faces] * self.radii.detach()[hit.piece]
 
     # --- what is blended ---
 

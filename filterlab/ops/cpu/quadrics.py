@@ -10,7 +10,8 @@ from torch import Tensor
 
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
-from filterlab.ops.cpu.quadric_hits import RAYS_OF_A_CHUNK, QuadricsJob, QuadricsVariant
+from filterlab.ops.cpu.quadric_hits import QuadricsJob, QuadricsVariant
+from filterlab.ops.cpu.quadric_walk import RAYS_OF_A_CHUNK
 from filterlab.ops.quadrics import Quadrics, Rays
 
 RAYS_AT_ONCE = 1 << 18
@@ -34,7 +35,11 @@ def _of_part(
     job = QuadricsJob(rays=len(origins), sheets=sheets, next=0, chunks=-(-len(origins) // RAYS_OF_A_CHUNK))
     job.point(boxes=given.tree.boxes, children=given.tree.children, leaves=given.leaves, tau=tau, place=place)
     job.point(**{name: getattr(rays, name).contiguous() for name in ("start", "along", "first", "last")})
-    fused = bool({"fma", "neon"} & compiler.features())
-    variant = QuadricsVariant(given.planes, given.kept(farthest), farthest, fused)
+    variant = QuadricsVariant(given.planes, given.kept(farthest), farthest, fused())
     pool.run(compiler.compiled(variant), [job] * max(1, min(torch.get_num_threads(), job.chunks)))
     return rays.t(tau), given.tree.numbers(place)
+
+
+def fused() -> bool:
+    """Whether the machine multiplies and adds with one rounding."""
+    return bool({"fma", "neon"} & compiler.features())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from filterlab.ops.differentiable import quadrics
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.slim import Cover, Members, Sheets
 
@@ -33,5 +34,5 @@ def members(
 
 def _driver(given: Cover, origins: Tensor, implementation: str | None):
     if implementation is None:
-        implementation = "reference"
+        implementation = "cpu" if quadrics.missing(given.quadrics, origins) is None else "reference"
     return driver(implementation, "slim")

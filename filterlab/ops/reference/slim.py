@@ -49,8 +49,9 @@ def _of_part(given: Cover, rays: Rays, count: int) -> Sheets:
     for _ in range(count):
         ends = _Ends(given, begin, torch.full_like(begin, torch.inf).where(begin < torch.inf, -torch.inf))
         walk(given.quadrics, rays, ends)
-        found.append(_blended(given, rays, begin, ends.limit))
-        begin = behind(torch.where(begin < torch.inf, ends.limit, torch.inf))
+        end = ends.limit.where(begin < torch.inf, torch.inf)
+        found.append(_blended(given, rays, begin, end))
+        begin = behind(end)
     tau, begin, end, normal, piece = (torch.stack(rows, 1) for rows in zip(*found, strict=True))
     begin, end = (-end, -begin) if rays.reversed else (begin, end)
     return Sheets(rays.t(tau), begin, end, normal, piece)
@@ -69,7 +70,7 @@ def _blended(given: Cover, rays: Rays, begin: Tensor, end: Tensor) -> tuple[Tens
     best = best.scatter_reduce(0, ray, torch.where(w == most[ray], place, -1), "amax")
     return (
         torch.where(sums[:, 0] > 0, sums[:, 1] / sums[:, 0], torch.inf),
-        begin,
+        torch.where(end < torch.inf, begin, end),
         end,
         sums[:, 2:],
         given.quadrics.tree.numbers(best),
