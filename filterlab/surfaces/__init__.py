@@ -2,7 +2,7 @@
 
     Field ────────────▶ LevelSet ──hit(rays)──▶ Hits ──at(rays, hits)──▶ points, normals, curvatures
     A, b, c in bounds ▶ Quadrics ──────┤
-    … in balls        ▶ Slim ──────────┘   blended
+    … in balls        ▶ Slim ──────────┘   blended;  points ──fit_slim──▶ Slim
                         LevelSet ──mesh(…)────▶ triangles
 
 Every surface finds its hits in its own way; derivatives of a hit, and what is known of the surface there, are written
@@ -11,13 +11,15 @@ once (`surfaces.base`).
 
 from filterlab.surfaces.base import Hits, Surface, SurfacePoints
 from filterlab.surfaces.bounds import Bounds, Planes, Spheres, Tetrahedra
+from filterlab.surfaces.fitting import fit_slim
 from filterlab.surfaces.level_set import LevelSet
 from filterlab.surfaces.meshes import Mesh, mesh
 from filterlab.surfaces.quadrics import Quadrics
-from filterlab.surfaces.slim import Slim
+from filterlab.surfaces.slim import Fit, Slim
 
 __all__ = [
     "Bounds",
+    "Fit",
     "Hits",
     "LevelSet",
     "Mesh",
@@ -28,5 +30,6 @@ __all__ = [
     "Surface",
     "SurfacePoints",
     "Tetrahedra",
+    "fit_slim",
     "mesh",
 ]

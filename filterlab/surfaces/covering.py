@@ -64,7 +64,7 @@ class Cover:
     Attributes:
         least_radius: (N,) of a ball around each point.
         weight, off: (N,) sums of weights, and of weights times distances.
-        fits: without pairs.
+        graphs, cuts: of the balls that were kept, part by part.
         sharp, smallest: numbers of balls that share an edge, and of those kept whatever their misfit.
     """
 
@@ -165,7 +165,7 @@ def _tried(scan: Scan, numbers: Tensor, radii: Tensor, pairs: Pairs, tolerance: 
     centers = scan.points[numbers]
     own, mean = _facing(scan, numbers, pairs, 0.0)
     graphs = fitted(scan.points, own, centers, radii, mean)
-    single, good = _judged(scan, graphs, own, tolerance, None)
+    single, good = _judged(scan, scan.spacing[numbers], graphs, own, tolerance, None)
     sharp, rest = torch.zeros_like(good), ~good
     own, _ = _facing(scan, numbers, pairs, _AWAY)
     own = own.of(rest)
@@ -175,19 +175,22 @@ def _tried(scan: Scan, numbers: Tensor, radii: Tensor, pairs: Pairs, tolerance: 
     side, own = side[bent[own.ball]], own.of(bent)
     rest = rest.nonzero()[:, 0][bent]
     edges = edges_in(scan.points, scan.normals, own, side, centers[rest], radii[rest])
-    double, met = _judged(scan, edges.graphs, edges.pairs, tolerance, edges.cuts)
+    spacing = scan.spacing[numbers[rest]].repeat_interleave(2)
+    double, met = _judged(scan, spacing, edges.graphs, edges.pairs, tolerance, edges.cuts)
     sharp[rest] = edges.valid & met.reshape(-1, 2).all(1)
     return Tried(single, good, double, sharp[rest].repeat_interleave(2), sharp)
 
 
-def _judged(scan: Scan, graphs: Graphs, pairs: Pairs, tolerance: float, cuts: Tensor | None) -> tuple[Fits, Tensor]:
+def _judged(
+    scan: Scan, spacing: Tensor, graphs: Graphs, pairs: Pairs, tolerance: float, cuts: Tensor | None
+) -> tuple[Fits, Tensor]:
     """The fits, with planes at ends, and (M,) whether they meet the tolerance."""
     off, count = graphs.distances(scan.points[pairs.point], pairs.ball), len(graphs.centers)
     w = weight(pairs.square)
     sums = summed(torch.stack((w, w * off * off, torch.ones_like(w)), 1), pairs.ball, count)
     met = sums[:, 1] <= tolerance**2 * sums[:, 0]
     met &= highest(off.abs(), pairs.ball, count) <= _WORST * tolerance
-    planes, loose = ends_in(scan.points, scan.ends, graphs, pairs)
+    planes, loose = ends_in(scan.points, scan.ends, spacing, graphs, pairs)
     met &= (loose == 0) | (sums[:, 2] < _LOOSE)
     edge = none(planes).expand(count, 1, 4) if cuts is None else cuts
     return Fits(graphs, pairs, off, torch.cat((planes, edge), 1)), met
@@ -210,7 +213,9 @@ def _apart(points: Tensor, numbers: Tensor, radius: float, drawn: np.random.Gene
     order = drawn.permutation(len(numbers))
     key = (cell * cell.new_tensor([1 << 42, 1 << 21, 1])).sum(-1).numpy()[order]
     numbers = numbers[torch.from_numpy(order[np.unique(key, return_index=True)[1]])]
-    return numbers[_independent(tree_of(points[numbers]).query_pairs(apart, output_type="ndarray"), len(numbers), drawn)]
+    return numbers[
+        _independent(tree_of(points[numbers]).query_pairs(apart, output_type="ndarray"), len(numbers), drawn)
+    ]
 
 
 def _independent(pairs: np.ndarray, count: int, drawn: np.random.Generator) -> Tensor:

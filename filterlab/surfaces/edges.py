@@ -24,7 +24,7 @@ from filterlab.surfaces.graphs import Graphs, Pairs, fitted, summed, unit
 CUTS = 4
 """Planes at the ends of what was scanned; one more is at an edge."""
 _DIRECTIONS = 8
-_NEAR = 2.0  # spacings from a plane is what it explains
+_NEAR = 1.0  # spacings from a plane is what it explains
 _SHARP = 0.77  # n₁·n₂ at most: 40°
 _SPREAD = 0.5  # of normals of points, before an edge is looked for
 _MIDDLE = 1 / 3  # of that range, in which
@@ -51,41 +51,46 @@ class Edges(NamedTuple):
 def edges_in(points: Tensor, normals: Tensor, pairs: Pairs, side: Tensor, centers: Tensor, radii: Tensor) -> Edges:
     """Two graphs in every ball, and the plane between, which is found from sides (P,) of points, 0 or 1."""
     count = len(centers)
-    twice = centers.repeat_interleave(2, 0), radii.repeat_interleave(2)
+    own = pairs._replace(ball=2 * pairs.ball + side)
     for _ in range(_ROUNDS):
-        own = pairs._replace(ball=2 * pairs.ball + side)
-        mean = unit(summed(weight(own.square)[:, None] * normals[own.point], own.ball, 2 * count))
-        graphs = fitted(points, own, *twice, torch.where((mean == 0).all(1, keepdim=True), mean.new_tensor([0.0, 0, 1]), mean))
-        place, normal = _edge(graphs)
-        across = unit(normal[:, 0] - normal[:, 1])
+        graphs = _halves(points, normals, own, centers, radii)
+        place, both = _edge(graphs)
+        across = unit(both[:, 0] - both[:, 1])
         y = (points[pairs.point] - centers[pairs.ball]) / radii[pairs.ball, None]
         height = (across[pairs.ball] * (y - place[pairs.ball])).sum(-1)
         turned = _turned(height, own.ball, count)
-        side = (height * turned[pairs.ball] < 0).long()
-    across, own = across * turned[:, None], pairs._replace(ball=2 * pairs.ball + side)
+        own = own._replace(ball=2 * pairs.ball + (height * turned[pairs.ball] < 0).long())
+    across = across * turned[:, None]
     plane = torch.cat((-across, (across * place).sum(-1, keepdim=True)), 1)
-    valid = ((normal[:, 0] * normal[:, 1]).sum(-1) < _SHARP) & (place.norm(dim=-1) < 1)
+    valid = ((both[:, 0] * both[:, 1]).sum(-1) < _SHARP) & (place.norm(dim=-1) < 1)
     valid &= torch.bincount(own.ball, minlength=2 * count).reshape(-1, 2).amin(1) >= _EACH
     return Edges(graphs, own, torch.stack((plane, -plane), 1).reshape(-1, 1, 4), valid)
 
 
-def ends_in(points: Tensor, ends: Tensor, graphs: Graphs, pairs: Pairs) -> tuple[Tensor, Tensor]:
-    """Planes (M, CUTS, 4) beyond the outermost points, and (M,) how many points at ends are near none of them."""
-    count = len(graphs.centers)
+def _halves(points: Tensor, normals: Tensor, pairs: Pairs, centers: Tensor, radii: Tensor) -> Graphs:
+    """Two graphs around each centre; one without points is level."""
+    rows = weight(pairs.square)[:, None] * normals[pairs.point]
+    mean = unit(summed(rows, pairs.ball, 2 * len(centers)))
+    mean[(mean == 0).all(1)] = mean.new_tensor([0.0, 0.0, 1.0])
+    return fitted(points, pairs, centers.repeat_interleave(2, 0), radii.repeat_interleave(2), mean)
+
+
+def ends_in(points: Tensor, ends: Tensor, spacing: Tensor, graphs: Graphs, pairs: Pairs) -> tuple[Tensor, Tensor]:
+    """Planes (M, CUTS, 4), one spacing (M,) of points beyond the outermost of them; (M,) how many points at ends are
+    near none."""
+    count, spacing = len(graphs.centers), (spacing / graphs.radii)[:, None]
     flat = graphs.local(points[pairs.point], pairs.ball)[:, :2]
-    inside = torch.bincount(pairs.ball, minlength=count).clamp_min(1)
     middle = summed(flat, pairs.ball, count)
     first = torch.atan2(-middle[:, 1], -middle[:, 0])
     angle = first[:, None] + torch.arange(_DIRECTIONS) * (2 * math.pi / _DIRECTIONS)
     direction = torch.stack((angle.cos(), angle.sin()), -1)
     reach = (direction[pairs.ball] @ flat[..., None])[..., 0]
-    spacing = (math.pi / inside).sqrt().to(reach)[:, None]
     limit = highest(reach, pairs.ball, count) + spacing
     limit, chosen = limit.sort(1)
     limit, chosen = limit[:, :CUTS], chosen[:, :CUTS]
     direction = direction.gather(1, chosen[..., None].expand(-1, -1, 2))
     reach = (direction[pairs.ball] @ flat[..., None])[..., 0]
-    near = ((limit - reach.new_tensor(1 + _NEAR) * spacing)[pairs.ball] < reach) & (limit < 1)[pairs.ball]
+    near = ((limit - (1 + _NEAR) * spacing)[pairs.ball] < reach) & (limit < 1)[pairs.ball]
     loose = ends[pairs.point] & ~near.any(1)
     normal = (direction[..., None] * graphs.frames[:, None, :2]).sum(2)
     planes = torch.cat((normal, -limit[..., None]), -1)
@@ -105,7 +110,7 @@ def highest(rows: Tensor, ball: Tensor, count: int) -> Tensor:
 
 
 def by_normals(normals: Tensor, pairs: Pairs, count: int) -> tuple[Tensor, Tensor]:
-    """Points (P,) by which half of the range of normals theirs is in, 0 or 1; and (M,) whether few are in its middle."""
+    """Sides of points (P,), 0 or 1, by where in the range of normals theirs is; (M,) whether few are in its middle."""
     own = normals[pairs.point]
     ones = torch.ones_like(pairs.square)
     inside = summed(ones, pairs.ball, count).clamp_min(1)

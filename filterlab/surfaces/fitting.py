@@ -6,7 +6,6 @@ points ──scans──▶ normals, ends, strays ──covering──▶ balls,
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,8 +15,8 @@ from filterlab.arrays import Array, as_tensor
 from filterlab.surfaces.bounds import check_rows
 from filterlab.surfaces.covering import Cover
 from filterlab.surfaces.graphs import Graphs
-from filterlab.surfaces.scans import scan_of
-from filterlab.surfaces.slim import Slim
+from filterlab.surfaces.scans import NEIGHBORS, scan_of
+from filterlab.surfaces.slim import Fit, Slim
 
 LEAST = 12
 """Points in a ball, at least."""
@@ -26,30 +25,6 @@ TOLERANCE = 1e-4
 _RANGE = (1e-12, 0.1)  # of tolerances
 _FLAT = 1e-9  # of the first extent of points is none
 _SCAN = 0.3  # of the work
-
-
-@dataclass(frozen=True)
-class Fit:
-    """How well a cover fits the points it was made for; lengths are in their units.
-
-    Attributes:
-        balls: how many.
-        points: that it was fitted to. duplicates, strays: that were left out.
-        tolerance: asked for.
-        rms, worst: of the distances of points from the blended surface, to first order.
-        sharp: balls that a sharp edge cuts.
-        smallest: balls of the fewest points that do not meet the tolerance: they follow noise, or detail too fine for it.
-    """
-
-    balls: int
-    points: int
-    duplicates: int
-    strays: int
-    tolerance: float
-    rms: float
-    worst: float
-    sharp: int
-    smallest: int
 
 
 def fit_slim(
@@ -74,7 +49,7 @@ def fit_slim(
 
     Returns:
         a `Slim` in float64 on the CPU, whose `fit` tells how well it fits. Holes stay open where they are wider than
-        some spacings. Not differentiable.
+        some spacings of points. Not differentiable in the points.
 
     Raises:
         TypeError: no such tensors. ValueError: other shapes; numbers that are not finite; fewer than `least` distinct
@@ -86,13 +61,13 @@ def fit_slim(
     told = progress or (lambda part: None)
     given, sides = _checked(points, normals, tolerance, least)
     kept = _distinct(given)
-    own = given[kept]
+    own, sides = given[kept], None if sides is None else sides[kept]
     low, high = own.aminmax(dim=0)
     middle, diagonal = (low + high) / 2, float((high - low).norm())
-    _check_extent((own - middle) / diagonal if diagonal else own, least)
-    scan, on = scan_of(
-        (own - middle) / diagonal, None if sides is None else sides[kept], seed, lambda part: told(_SCAN * part)
-    )
+    _check_extent(own - middle, least)
+    scan, on = scan_of((own - middle) / diagonal, sides, seed, lambda part: told(_SCAN * part))
+    if len(on) < least:
+        raise ValueError(f"expected points close to others; of {len(own)} all but {len(on)} are strays")
     cover = Cover.of(scan, tolerance, least, lambda part: told(_SCAN + (1 - _SCAN) * part))
     slim = _slim(cover, middle, diagonal)
     slim.fit = _told(cover, len(given) - len(own), len(own) - len(on), diagonal)
@@ -109,16 +84,15 @@ def _slim(cover: Cover, middle: Tensor, diagonal: float) -> Slim:
 
 
 def _in_world(cuts: Tensor, centers: Tensor, radii: Tensor) -> Tensor | None:
-    """Planes in balls as halfspaces of the world, none of them as one that holds all of its ball; None where none is."""
-    number = (cuts[..., :3] != 0).any(-1).sum(1)
-    if not int(number.max()):
+    """Planes in balls as halfspaces of the world, as few as there are; no plane is one that holds all of its ball."""
+    no = (cuts[..., :3] == 0).all(-1)
+    most = int((~no).sum(1).max())
+    if not most:
         return None
-    cuts = cuts.gather(1, (cuts[..., :3] == 0).all(-1).long().argsort(dim=1, stable=True)[..., None].expand_as(cuts))
-    cuts = cuts[:, : int(number.max())]
-    normal = torch.where((cuts[..., :3] == 0).all(-1, keepdim=True), cuts.new_tensor([0.0, 0.0, 1.0]), cuts[..., :3])
-    d = torch.where((cuts[..., :3] == 0).all(-1), -2.0, cuts[..., 3])
-    d = radii[:, None] * d - (normal * centers[:, None]).sum(-1)
-    return torch.cat((normal, d[..., None]), -1)
+    cuts = cuts.gather(1, no.long().argsort(dim=1, stable=True)[:, :most, None].expand(-1, -1, 4))
+    no = (cuts[..., :3] == 0).all(-1, keepdim=True)
+    normal, d = torch.where(no, cuts.new_tensor([0.0, 0.0, 1.0, -2.0]), cuts).split((3, 1), -1)
+    return torch.cat((normal, radii[:, None, None] * d - (normal * centers[:, None]).sum(-1, keepdim=True)), -1)
 
 
 def _told(cover: Cover, duplicates: int, strays: int, diagonal: float) -> Fit:
@@ -158,10 +132,8 @@ def _distinct(points: Tensor) -> Tensor:
 
 def _check_extent(points: Tensor, least: int) -> None:
     """Raises ValueError unless there are enough, and not all on a line."""
-    if len(points) < max(least, 20):
-        raise ValueError(f"expected at least {max(least, 20)} points at different places; got {len(points)}")
+    if len(points) < (fewest := max(least, NEIGHBORS + 1)):
+        raise ValueError(f"expected at least {fewest} points at different places; got {len(points)}")
     _, extent, _ = torch.linalg.svd(points - points.mean(0), full_matrices=False)
     if float(extent[1]) <= _FLAT * float(extent[0]):
         raise ValueError(f"expected points on a surface; all {len(points)} lie on one line")
-
-

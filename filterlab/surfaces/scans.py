@@ -19,6 +19,7 @@ from filterlab.surfaces.graphs import Graphs, Pairs, fitted, unit
 from filterlab.surfaces.orienting import oriented
 
 NEIGHBORS = 16  # of a point, by which its normal is found
+_NEAREST = 6  # by which its spacing is
 _AROUND = 20  # that tell whether it is at an end
 _GAP = 0.8 * np.pi  # between directions to them, at an end
 _ALONG = 2  # of them that are at an end too
@@ -39,12 +40,14 @@ class Scan:
     Attributes:
         points: (N, 3) float64.
         normals: (N, 3), of length 1, towards the outside.
+        spacing: (N,) between neighbours: √ of the area that each of the nearest six has.
         ends: (N,) whether the surface ends there: nothing is on one side.
         seed: of what is drawn.
     """
 
     points: Tensor
     normals: Tensor
+    spacing: Tensor
     ends: Tensor
     seed: int
 
@@ -121,13 +124,14 @@ def scan_of(points: Tensor, normals: Tensor | None, seed: int, progress: Progres
         given = unit(normals[kept])
         own = torch.where(((own * given).sum(-1) < 0)[:, None], -own, own)
     ends = _ends(graphs.frames, points[kept], near)
-    return Scan(points[kept][on], own[on], ends[on], seed), kept[on]
+    spacing = far[:, _NEAREST] * (np.pi / (_NEAREST + 1)) ** 0.5
+    return Scan(points[kept][on], own[on], spacing[on], ends[on], seed), kept[on]
 
 
 def tree_of(points: Tensor) -> Any:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    return cKDTree(points.numpy())
+    return KDTree(points.numpy())
 
 
 def _neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -141,7 +145,7 @@ def _near_others(points: Tensor) -> Tensor:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    near, distance = _neighbors(points, 6)
+    near, distance = _neighbors(points, _NEAREST)
     spacing = distance[:, -1]
     usual = spacing[near[:, 1:]].median(1).values
     close = distance[:, 1:] <= _APART * torch.minimum(usual[:, None], usual[near[:, 1:]])
