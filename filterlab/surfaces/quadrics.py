@@ -250,13 +250,14 @@ class Quadrics(Surface):
         """
         if self.faces == "both":
             return self
-        found = self.described.some(self._facing(eye.detach().to(self.bounds.centers)))
+        found = self.described.some(self.facing(eye))
         other = copy.copy(self)
         other._built = tuple(x._version for x in self.tensors), found
         return other
 
-    def _facing(self, eye: Tensor) -> Tensor:
-        """(M,) whether some point of the bounds may face it."""
+    def facing(self, eye: Tensor) -> Tensor:
+        """(M,) whether some point within the bounds may show the side that counts to a world point (3,)."""
+        eye = eye.detach().to(self.bounds.centers)
         sign = 1 if self.faces == "front" else -1
         A, b, c = (sign * x for x in self._about_centers())
         e = eye - self.bounds.centers

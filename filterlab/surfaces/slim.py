@@ -144,7 +144,7 @@ class Slim(Surface):
         return Hits(found.t[:, 0], found.piece[:, 0], found.blend[:, 0])
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        found = [ops.sheets(side, origins, directions, sheets, farthest) for side in self._now().sides]
+        found = [ops.sheets(side, origins, directions, sheets, farthest) for side in self.described]
         t, *rest, normal, piece = (torch.cat(rows, 1) for rows in zip(*found, strict=True))
         blend = torch.cat((torch.stack((t, *rest), -1), normal), -1)
         if len(found) > 1:
@@ -158,6 +158,22 @@ class Slim(Surface):
         """A part of the ball's radius: where backs count, what a hit is blended of has to be behind it."""
         assert hit.piece is not None
         return _LIFTS[self.faces] * self.radii.detach()[hit.piece]
+
+    def seen_from(self, eye: Tensor) -> Slim:
+        """For rays from a world point (3,): the same hits, without the quadrics that show it no face that counts.
+
+        As `Quadrics.seen_from`, by the test for balls: for many rays from one place. With faces "both" nothing is left
+        out.
+        """
+        if self.faces == "both":
+            return self
+        built, other = self._now(), copy.copy(self)
+        local = copy.copy(built.local)
+        local.faces = self.faces
+        kept = local.facing(eye)
+        sides = [replace(side, quadrics=side.quadrics.some(kept)) for side in built.sides]
+        other._built = built._replace(sides=tuple(sides))
+        return other
 
     # --- what is blended ---
 
@@ -205,7 +221,7 @@ class Slim(Surface):
     def _members(self, origins: Tensor, directions: Tensor, blend: Tensor) -> Members:
         """Hits that those of rays (M, 3) are blended of; all of a sheet face one way."""
         begin, end = blend[:, _ENDS].unbind(1)
-        sides = self._now().sides
+        sides = self.described
         if len(sides) == 1:
             return ops.members(sides[0], origins, directions, begin, end)
         back = (blend[:, _NORMAL] * directions).sum(-1) > 0
@@ -214,6 +230,11 @@ class Slim(Surface):
         return Members(*(torch.cat(rows) for rows in zip(*found, strict=True)))
 
     # --- what is cast ---
+
+    @property
+    def described(self) -> tuple[Cover, ...]:
+        """The index and the numbers in it, as they are now, for each side that counts."""
+        return self._now().sides
 
     @property
     def _local(self) -> Quadrics:

@@ -160,7 +160,7 @@ class Walk(ABC):
                 b.if_else(b.icmp_signed("<", node, I32(0))) as (leaf, inner),
             ):
                 with leaf:
-                    self._leaf(ray, b.sext(b.xor(node, I32(-1)), I64), take)
+                    self.leaf(ray, b.sext(b.xor(node, I32(-1)), I64), take)
                 with inner:
                     self._node(ray, b.sext(node, I64))
 
@@ -232,7 +232,7 @@ class Walk(ABC):
 
     # --- leaves ---
 
-    def _leaf(self, ray: Ray, leaf: Value, take: Take) -> None:
+    def leaf(self, ray: Ray, leaf: Value, take: Take) -> None:
         e, b = self.lanes, self.builder
         size = WIDTH * (PLANES + 4 * self.variant.planes)
         base = e.advance(self.job.leaves, b.mul(leaf, I64(size)), DOUBLE)

@@ -1,7 +1,8 @@
 """The programs that cast rays at blended quadrics (`quadric_walk`).
 
-Sheets, for each of them two walks: where it ends, then sums of weights, τ and normals of all hits before that, lane by
-lane. Members: all hits of a ray between two τ, counted, or written where a count before says.
+Sheets, for each of them a walk to where it ends, then sums of weights, τ and normals of all hits before that, lane by
+lane: of the leaves in which the walk came upon hits, or, where they were too many to be noted, by a second walk.
+Members: all hits of a ray between two τ, counted, or written where a count before says.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from filterlab.ops.slim import INNER, LEAST_WEIGHT, OUTER, STEEP
 from filterlab.ops.tree import WIDTH
 
 _PLACES = ir.VectorType(I64, WIDTH)
+_NOTED = 64  # leaves with hits
 
 SHEETS: dict[str, type] = quadric_walk.FIELDS | {
     "sheets": ctypes.c_int64,  # k
@@ -80,12 +82,17 @@ class MembersVariant:
 
 
 class _Sheets(Walk):
+    def write(self) -> None:
+        self.leaves = self.lanes.reserve(I64, _NOTED)
+        self.noted, self.last = self.lanes.variable(I64(0)), self.lanes.variable(I64(-1))
+        super().write()
+
     def cast(self, ray: Ray) -> None:
         e, b, j = self.lanes, self.builder, self.job
         self.begin, self.sheet = e.variable(DOUBLE(float("-inf"))), e.variable(I64(0))
         with e.repeat_while(lambda: b.icmp_signed("<", self.sheet.value, j.sheets)):
             own = self._from(ray, self.begin.value)
-            self.limit.value = DOUBLE(float("inf"))
+            self.limit.value, self.noted.value, self.last.value = DOUBLE(float("inf")), I64(0), I64(-1)
             self.walk(own, self._end)
             some = b.fcmp_ordered("<", self.limit.value, DOUBLE(float("inf")))
             with b.if_else(some) as (then, otherwise):
@@ -123,12 +130,26 @@ class _Sheets(Walk):
             end = e.multiply_add(e.everywhere(self.job.offset), radius, tau)
             least = b.fneg(most_of(e, e.where(hit, e.negate(end), e.constant(float("-inf")))))
             self.limit.value = b.select(b.fcmp_ordered("<", least, self.limit.value), least, self.limit.value)
+            self._note(met.leaf)
+
+    def _note(self, leaf: Value) -> None:
+        """Once, though it may be told of one after the other: of fronts and backs."""
+        e, b = self.lanes, self.builder
+        slot = e.smaller(self.noted.value, I64(_NOTED - 1))
+        b.store(leaf, e.advance(self.leaves, slot, I64))
+        again = b.icmp_signed("==", leaf, self.last.value)
+        self.noted.value = b.add(self.noted.value, b.select(again, I64(0), I64(1)))
+        self.last.value = leaf
 
     def _blend(self, ray: Ray) -> None:
         e, b, j = self.lanes, self.builder, self.job
         self.sums = [e.variable(e.constant(0)) for _ in range(5)]
         self.most, self.best = e.variable(e.constant(0)), e.variable(ir.Constant(_PLACES, [-1] * WIDTH))
-        self.walk(ray, self._add)
+        with b.if_else(b.icmp_signed("<=", self.noted.value, I64(_NOTED))) as (few, many):
+            with few, e.repeat(I64(0), self.noted.value) as slot:
+                self.leaf(ray, b.load(e.advance(self.leaves, slot, I64), typ=I64), self._add)
+            with many:
+                self.walk(ray, self._add)
         weight, tau, *normal = (e.total(each.value) for each in self.sums)
         row = b.add(b.mul(ray.number, j.sheets), self.sheet.value)
         for array, number in ((j.tau, b.fdiv(tau, weight)), (j.begin, self.begin.value), (j.end, self.limit.value)):

@@ -1,7 +1,11 @@
-"""Covers of a torus: a graph of second order in each of many balls, as fits give them. Imports nothing of filterlab."""
+"""Quadrics of which the surface is known: covers of a torus, and a sphere in tetrahedra.
+
+Of the torus a graph of second order in each of many balls, as fits give them.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -54,3 +58,47 @@ def _spread(count: int) -> tuple[Tensor, Tensor]:
 def distance(points: Tensor) -> Tensor:
     """(...) signed, of the torus, positive outside."""
     return torch.hypot(torch.hypot(points[..., 0], points[..., 1]) - MAJOR, points[..., 2]) - MINOR
+
+
+class Clipped(NamedTuple):
+    """Quadrics in tetrahedra: A (M, 3, 3), b (M, 3), c (M,) about the world's origin, and corners (M, 4, 3)."""
+
+    A: Tensor
+    b: Tensor
+    c: Tensor
+    corners: Tensor
+
+
+def sphere(count: int) -> Clipped:
+    """About `count` tetrahedra that the unit sphere passes through, each with the sphere as its quadric.
+
+    Of cubes that are cut in six around a diagonal.
+    """
+    n = max(2, round(math.sqrt(count / _OF_A_GRID)))
+    corners = _tetrahedra(_cubes(n), 2.4 / n)
+    value = corners.square().sum(-1) - 1
+    corners = corners[(value.amin(1) < 0) & (value.amax(1) > 0)]
+    m, dtype = len(corners), torch.float64
+    A = torch.eye(3, dtype=dtype).expand(m, 3, 3)
+    return Clipped(A, torch.zeros(m, 3, dtype=dtype), torch.full((m,), -1.0, dtype=dtype), corners)
+
+
+_OF_A_GRID = 15.0  # n² tetrahedra of a grid of n³ cubes are met by a sphere of 5/6 of its width
+
+
+def _cubes(n: int) -> Tensor:
+    """The lower corners (Q, 3) of the cubes that the sphere may pass through, in [−1.2, 1.2]³."""
+    axis = torch.arange(n, dtype=torch.float64) * (2.4 / n) - 1.2
+    near = []
+    for x in axis:  # a layer at a time: n³ would not fit
+        layer = torch.cartesian_prod(x[None], axis, axis)
+        off = (layer + 1.2 / n).norm(dim=1) - 1
+        near.append(layer[off.abs() <= 2.4 / n])
+    return torch.cat(near)
+
+
+def _tetrahedra(cubes: Tensor, side: float) -> Tensor:
+    """(6 Q, 4, 3): from the lower to the upper corner along the axes in every order."""
+    steps = torch.eye(3, dtype=cubes.dtype)[torch.tensor(list(itertools.permutations(range(3))))].cumsum(1)
+    ways = torch.cat((torch.zeros(6, 1, 3, dtype=cubes.dtype), steps), 1)
+    return (cubes[:, None, None] + side * ways).flatten(0, 1)
