@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -72,6 +72,8 @@ class Slim(Surface):
 
     max_order = 2
     in_pieces = True
+    fit: Fit | None = None
+    """How well it fits the points it was made for (`fit_slim`); None: it was made of numbers."""
 
     def __init__(
         self,
@@ -248,6 +250,30 @@ class Slim(Surface):
             sides = [Cover(replace(local.described, faces=side), self.offset) for side in _SIDES[self.faces]]
             self._built = _Built(versions, local, tuple(sides))
         return self._built
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a cover fits the points it was made for; lengths are in their units.
+
+    Attributes:
+        balls: how many.
+        points: that it was fitted to. duplicates, strays: that were left out.
+        tolerance: asked for.
+        rms, worst: of the distances of points from the blended surface, to first order.
+        sharp: balls that a sharp edge cuts.
+        smallest: balls of the fewest points that do not meet the tolerance: they follow noise, or too fine detail.
+    """
+
+    balls: int
+    points: int
+    duplicates: int
+    strays: int
+    tolerance: float
+    rms: float
+    worst: float
+    sharp: int
+    smallest: int
 
 
 class _Built(NamedTuple):
