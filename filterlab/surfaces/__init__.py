@@ -14,6 +14,7 @@ from filterlab.surfaces.bilinear import BilinearQuads
 from filterlab.surfaces.bounds import Bounds, Planes, Spheres, Tetrahedra
 from filterlab.surfaces.level_set import LevelSet
 from filterlab.surfaces.meshes import Mesh, mesh
+from filterlab.surfaces.molecular_skin import molecular_skin
 from filterlab.surfaces.quadrics import Quadrics
 
 __all__ = [
@@ -29,4 +30,5 @@ __all__ = [
     "SurfacePoints",
     "Tetrahedra",
     "mesh",
+    "molecular_skin",
 ]
