@@ -18,6 +18,7 @@ from filterlab.surfaces.fitting import fit_slim
 from filterlab.surfaces.height_field import HeightField
 from filterlab.surfaces.level_set import LevelSet
 from filterlab.surfaces.meshes import Mesh, mesh
+from filterlab.surfaces.molecular_skin import molecular_skin
 from filterlab.surfaces.quadrics import Quadrics
 from filterlab.surfaces.relief import Relief
 from filterlab.surfaces.slim import Fit, Slim
@@ -40,4 +41,5 @@ __all__ = [
     "Tetrahedra",
     "fit_slim",
     "mesh",
+    "molecular_skin",
 ]

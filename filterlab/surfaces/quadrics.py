@@ -23,6 +23,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from filterlab.fields.base import Field
 from filterlab.ops import quadrics as description
 from filterlab.surfaces import quadric_kinds as kinds
 from filterlab.surfaces.bounds import Bounds, check_rows
@@ -153,6 +154,24 @@ class Quadrics(InTree[description.Quadrics]):
         parts = [kinds.paraboloids(apexes, bases, radii)]
         parts += [kinds.discs(bases, bases - apexes, radii)] if caps else []
         return cls(*kinds.joined(parts), faces=faces)
+
+    @classmethod
+    def of_level_set(cls, field: Field, level: float, *, faces: str = "both") -> Quadrics:
+        """The level set of a quadratic super spline as quadrics in its tetrahedra: F = f − level.
+
+        Args:
+            field: of the method `qss`, unbatched.
+            level: a finite number.
+            faces: as of `Quadrics`; outside is where values are greater, as of a `LevelSet`, which shows the same and
+                stores nothing for it.
+
+        Where a piece is on the level everywhere nothing is hit. Raises TypeError, ValueError: another field; a level
+        that no piece has. No derivatives in what the field is made of: a `LevelSet` has them.
+
+        Source: Stoll, Gumhold & Seidel, Incremental raycasting of piecewise quadratic surfaces on the GPU, 2006,
+        sections 5 and 6.
+        """
+        return cls(*kinds.level_set(field, level), faces=faces)
 
     @classmethod
     def joined(cls, parts: Sequence[Quadrics]) -> Quadrics:
