@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from filterlab.cli.loading import Progress, reading
-from filterlab.cli.options import Quiet, check_asked
+from filterlab.cli.options import Maybe, Quiet, check_asked
 from filterlab.cli.saving import OutputFile
 from filterlab.cli.scenes import scene_asked_for
 from filterlab.cli.terminal import progress_bar, show
@@ -47,10 +47,10 @@ class Render:
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml | VOLUME")]
     """The scene, or a volume."""
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
+    output: Annotated[Maybe[Path], arg(aliases=["-o"], metavar="FILE")] = None
     """The picture to write: a name that ends in .png or .jpg (quality 95); a file of that name is replaced. With
     --turntable .gif, .png (animated), or a folder for numbered .png files, which must be new or empty."""
-    turntable: Annotated[int | None, arg(metavar="N")] = None
+    turntable: Annotated[Maybe[int], arg(metavar="N")] = None
     """Make N pictures, a whole turn of the camera about what is up, through its target."""
     explain: bool = False
     """Show what the picture would take, and what the scene leaves out; no picture is made."""
