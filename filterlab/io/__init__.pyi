@@ -2,6 +2,7 @@ from .affines import CONVENTIONS, load_affine
 from .atomic import atomic_write
 from .bounded import VolumeFileError, VolumeHeader
 from .config import ConfigError, StrictModel, dump_config, load_config
+from .heights import HEIGHT_FORMATS, describe_heights, load_heights, save_heights
 from .images import load_image, save_animation, save_image
 from .meshes import MESH_FORMATS, load_mesh, save_mesh
 from .volumes import FORMATS, describe, load_volume, save_volume
@@ -9,6 +10,7 @@ from .volumes import FORMATS, describe, load_volume, save_volume
 __all__ = [
     "CONVENTIONS",
     "FORMATS",
+    "HEIGHT_FORMATS",
     "MESH_FORMATS",
     "ConfigError",
     "StrictModel",
@@ -16,13 +18,16 @@ __all__ = [
     "VolumeHeader",
     "atomic_write",
     "describe",
+    "describe_heights",
     "dump_config",
     "load_affine",
     "load_config",
+    "load_heights",
     "load_image",
     "load_mesh",
     "load_volume",
     "save_animation",
+    "save_heights",
     "save_image",
     "save_mesh",
     "save_volume",

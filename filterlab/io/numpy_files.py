@@ -56,7 +56,7 @@ def sidecar_of(path: Path) -> Path:
     return path.with_name(path.name + ".yaml")
 
 
-def _array_header(path: Path, stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+def array_header(path: Path, stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
     """(shape, fortran order, dtype) of the array that begins at the stream's position."""
     start = stream.read(8)
     version = tuple(start[6:])
@@ -88,7 +88,7 @@ def _check_shape(path: Path, shape: tuple[int, ...]) -> tuple[int, ...]:
     return check_size(path, shape)
 
 
-def _stored_order(shape: tuple[int, ...], fortran: bool) -> tuple[int, ...]:
+def stored_order(shape: tuple[int, ...], fortran: bool) -> tuple[int, ...]:
     return shape[::-1] if fortran else shape
 
 
@@ -129,10 +129,10 @@ class Part:
 def read_npy_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
     """The checked header of an .npy file (and of its sidecar). Raises VolumeFileError."""
     with path.open("rb") as file:
-        shape, fortran, dtype = _array_header(path, file)
+        shape, fortran, dtype = array_header(path, file)
         offset = file.tell()
     shape, target = _check_shape(path, shape), sample_dtype(path, dtype)
-    stored = Stored(path, path, "raw", offset, 0, _stored_order(shape, fortran), dtype)
+    stored = Stored(path, path, "raw", offset, 0, stored_order(shape, fortran), dtype)
     stored.check()
     affine, part = _sidecar_affine(path, shape), Part.of(path, shape, fortran, frame, channel)
     return VolumeHeader(
@@ -184,7 +184,7 @@ class _Archive(io.FileIO):
 
 
 @contextmanager
-def _archive(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]]:
+def open_archive(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]]:
     """The archive and its arrays by name; damage anywhere in it becomes VolumeFileError."""
     try:
         with _Archive(path) as file, zipfile.ZipFile(file) as archive:
@@ -198,7 +198,7 @@ def _archive(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile.Zi
         raise VolumeFileError(path, "an intact npz archive", f"{type(error).__name__}: {error}"[:200]) from None
 
 
-def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> BinaryIO:
+def open_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> BinaryIO:
     """An open member whose claimed sizes are plausible."""
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise VolumeFileError(path, f"{info.filename} stored or deflated", f"zip method {info.compress_type}")
@@ -213,11 +213,11 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Bina
 
 def read_npz_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
     """The checked header of an .npz file. Raises VolumeFileError."""
-    with _archive(path) as (archive, members):
+    with open_archive(path) as (archive, members):
         name = _samples_name(path, members)
         info = members[name]
-        with _member(path, archive, info) as stream:
-            shape, fortran, dtype = _array_header(path, stream)
+        with open_member(path, archive, info) as stream:
+            shape, fortran, dtype = array_header(path, stream)
             offset = stream.tell()
         shape, target = _check_shape(path, shape), sample_dtype(path, dtype)
         claimed = math.prod(shape) * dtype.itemsize
@@ -228,9 +228,9 @@ def read_npz_header(path: Path, frame: int | None = None, channel: int | None = 
     part = Part.of(path, shape, fortran, frame, channel)
 
     def read() -> np.ndarray:
-        with _archive(path) as (archive, _), _member(path, archive, info) as stream:
+        with open_archive(path) as (archive, _), open_member(path, archive, info) as stream:
             stream.read(offset)
-            array = read_array(path, stream, _stored_order(shape, fortran), dtype, part.at, raw=False)
+            array = read_array(path, stream, stored_order(shape, fortran), dtype, part.at, raw=False)
         return part.samples(path, array, target)
 
     return VolumeHeader(
@@ -257,17 +257,21 @@ def _samples_name(path: Path, members: dict[str, Any]) -> str:
     return others[0]
 
 
+def small_numbers(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, shape: tuple[int, ...]) -> np.ndarray:
+    """The few numbers of that shape in a member, float64. Raises VolumeFileError."""
+    with open_member(path, archive, info) as stream:
+        found, fortran, dtype = array_header(path, stream)
+        if found != shape or dtype.kind not in "fiu" or dtype.itemsize > 8:
+            name = info.filename.removesuffix(_SUFFIX)
+            raise VolumeFileError(path, f"numbers of shape {shape} as {name}", f"{dtype} of shape {found}"[:100])
+        buffer = read_exactly(path, stream, math.prod(shape) * dtype.itemsize, allocate=False)
+    array = native(buffer, dtype, stored_order(shape, fortran)).astype(np.float64)
+    return array.T if fortran else array
+
+
 def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]) -> np.ndarray:
     def small(name: str, shape: tuple[int, ...], default: np.ndarray) -> np.ndarray:
-        if name not in members:
-            return default
-        with _member(path, archive, members[name]) as stream:
-            found, fortran, dtype = _array_header(path, stream)
-            if found != shape or dtype.kind not in "fiu" or dtype.itemsize > 8:
-                raise VolumeFileError(path, f"numbers of shape {shape} as {name}", f"{dtype} of shape {found}"[:100])
-            buffer = read_exactly(path, stream, math.prod(shape) * dtype.itemsize, allocate=False)
-        array = native(buffer, dtype, _stored_order(shape, fortran)).astype(np.float64)
-        return array.T if fortran else array
+        return small_numbers(path, archive, members[name], shape) if name in members else default
 
     if "affine" in members:
         if "spacing" in members or "origin" in members:
