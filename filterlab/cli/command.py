@@ -8,7 +8,6 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import version
 from typing import Annotated, Any, Union
 
 import tyro
@@ -52,6 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments in (["--version"], ["-V"]):
+        from importlib.metadata import version
+
         print(f"filterlab {version('filterlab')}")
         return OK
     overrides: dict[str, str] = {}

@@ -60,7 +60,7 @@ class Mesh:
         from filterlab.scenes.plan_report import table
         from filterlab.surfaces.meshes import mesh
 
-        scene = scene_asked_for(self.scene, overrides, self.output, of_surface=True)
+        scene, _ = scene_asked_for(self.scene, overrides, self.output, of_surface=True)
         with progress_bar(self.quiet) as progress, reading(progress):
             prepared = build(scene)
         assert isinstance(prepared, PreparedSurface)

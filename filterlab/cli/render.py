@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from filterlab.scenes.build import AnyPrepared
     from filterlab.scenes.model import Scene
+    from filterlab.volume import Volume
 
 
 @dataclass(frozen=True)
@@ -60,31 +61,31 @@ class Render:
     def run(self, overrides: dict[str, str]) -> None:
         check_asked(self.output, self.explain, ".png")
         output = None if self.output is None else self._output(self.output)
-        scene = scene_asked_for(self.scene, overrides, self.output)
+        scene, volume = scene_asked_for(self.scene, overrides, self.output)
         if self.turntable is not None:
             from filterlab.scenes.turntable import check_turn
 
             check_turn(scene, self.turntable)
         if output is None:
-            self._explain(scene)
+            self._explain(scene, volume)
             return
         with progress_bar(self.quiet) as progress, reading(progress):
-            pictures = _Pictures(self._views(scene), progress)
+            pictures = _Pictures(self._views(scene, volume), progress)
             self._write(pictures, output.path)
         output.tell(pictures.told)
 
-    def _views(self, scene: Scene) -> list[AnyPrepared]:
+    def _views(self, scene: Scene, volume: Volume | None) -> list[AnyPrepared]:
         from filterlab.scenes.build import build
         from filterlab.scenes.turntable import turntable
 
-        prepared = build(scene)
+        prepared = build(scene, volume)
         return [prepared] if self.turntable is None else turntable(prepared, self.turntable)
 
-    def _explain(self, scene: Scene) -> None:
+    def _explain(self, scene: Scene, volume: Volume | None) -> None:
         from filterlab.scenes.plan import plan
         from filterlab.scenes.plan_report import table
 
-        views = self._views(scene)
+        views = self._views(scene, volume)
         show(table(plan(views[0]), pictures=len(views)))
 
     def _write(self, pictures: _Pictures, output: Path) -> None:

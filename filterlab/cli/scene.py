@@ -40,4 +40,4 @@ class Scene:
             return
         from filterlab.io.config import dump_config
 
-        print(dump_config(scene_asked_for(self.scene, overrides, None)), end="")
+        print(dump_config(scene_asked_for(self.scene, overrides, None)[0]), end="")

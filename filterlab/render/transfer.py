@@ -120,14 +120,18 @@ class TransferFunction(Table):
         return cls(x, colors.color(colors.locate(x)), ramp.opacity(ramp.locate(x)), unit)
 
     @classmethod
-    def suggested(cls, field: Field) -> Self:
+    def suggested(cls, field: Field, samples: suggestion.Sampled | None = None) -> Self:
         """One to begin with, from the histogram of a field: what is around is clear, up to three classes of values are
         not, in blue, tan and ivory; see `filterlab.render.suggestion`. Opacities are for a voxel.
+
+        Args:
+            field: unbatched.
+            samples: of it, where they are known: `filterlab.render.suggestion.sampled(field)`.
 
         Raises:
             ValueError: a batched field, or one without a finite value.
         """
-        return cls(*suggestion.tables(suggestion.sampled(field)), field.domain.voxel_size)
+        return cls(*suggestion.tables(samples or suggestion.sampled(field)), field.domain.voxel_size)
 
     @property
     def requires_grad(self) -> bool:
