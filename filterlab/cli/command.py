@@ -13,7 +13,7 @@ from typing import Annotated, Any, Union
 import tyro
 from tyro.conf import subcommand
 
-from filterlab.cli.convert import Convert
+from filterlab.cli.convert import Convert, with_output_last
 from filterlab.cli.info import Info
 from filterlab.cli.mesh import Mesh
 from filterlab.cli.methods import Methods
@@ -57,6 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return OK
     overrides: dict[str, str] = {}
     try:
+        if arguments[:1] == ["convert"]:
+            arguments = with_output_last(arguments)
         if arguments and arguments[0] in SHOWING:
             arguments, overrides = split_overrides(SHOWING[arguments[0]], arguments)
         with _warnings_told():

@@ -119,12 +119,12 @@ class Resample:
 
         import torch
 
-        from filterlab.resampling import resample
+        from filterlab.resampling import check_fill, resample
         from filterlab.volume import Volume
 
         working = _working_type(stored, source)
         check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)
-        self._check_fill(stored)
+        check_fill(self.fill, stored or "float32", "--fill")
         limit = limit_in_bytes(self.max_gigabytes)
         shape = [*source.shape[:-3], *self._new_size(source, target)]
         itemsize = max(working.itemsize, source.dtype.itemsize if keeps else 0, np.dtype(stored or "float32").itemsize)
@@ -170,16 +170,6 @@ class Resample:
         volume = source if moved is None else describe(moved)
         onto_grid = (target or source) if onto is None else describe(onto)
         return load_affine(self.affine, self.convention, volume=volume, target=onto_grid, inverse=self.inverse)
-
-    def _check_fill(self, stored: str | None) -> None:
-        """Raises ValueError for a fill that no integer of the result is."""
-        import numpy as np
-
-        if self.fill is None or stored is None or stored.startswith("float"):
-            return
-        info = np.iinfo(stored)
-        if not (math.isfinite(self.fill) and self.fill == int(self.fill) and info.min <= self.fill <= info.max):
-            raise ValueError(f"expected a --fill that {stored} holds; got {self.fill:g}")
 
     def _new_size(self, source: VolumeHeader, target: VolumeHeader | None) -> list[float]:
         """Voxels along x, y, z of the result; checks what was asked."""

@@ -16,7 +16,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, as_numbers
 from filterlab.fields.base import Domain, Field
 from filterlab.geometry import times_matrix
 from filterlab.ops.reference.optics import Table
@@ -271,7 +271,7 @@ def check_size(size: Sequence[int]) -> tuple[int, int]:
 
 
 def _vector(value: Vector | float, device: torch.device | None = None) -> Tensor:
-    return torch.as_tensor(as_tensor(value), dtype=torch.float64, device=device)
+    return as_numbers(value, device=device)
 
 
 def _number(expected: str, value: float | Tensor) -> float:
