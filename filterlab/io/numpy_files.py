@@ -20,10 +20,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-from pydantic import Field
 
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import (
@@ -39,29 +38,18 @@ from filterlab.io.bounded import (
     native,
     read_array,
     read_exactly,
-    regular_file,
     sample_dtype,
     scaled,
 )
-from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, dump_config, load_config
 
 if TYPE_CHECKING:
     from filterlab.volume import Volume
 
-Count = Annotated[int, Field(ge=1)]
-Row = tuple[float, float, float, float]
 _GEOMETRY = ("affine", "spacing", "origin")
 _SUFFIX = ".npy"
 MAX_NPY_HEADER = 2**16
 MAX_NPY_TEXT = 1024  # of it, padding aside, which NumPy evaluates as Python: 0.2 s and more for ten times that
 MAX_DIRECTORY = 2**18  # bytes; of an entry, 46 and more, zipfile makes an object of 700
-
-
-class GeometrySidecar(StrictModel):
-    """`NAME.npy.yaml`: where the samples of `NAME.npy` lie."""
-
-    size: tuple[Count, Count, Count]
-    affine: tuple[Row, Row, Row, Row]
 
 
 def sidecar_of(path: Path) -> Path:
@@ -166,10 +154,9 @@ def _sidecar_affine(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     sidecar = sidecar_of(path)
     if not sidecar.exists():
         return np.eye(4)
-    try:
-        found = load_config(regular_file(sidecar), GeometrySidecar, max_bytes=MAX_SIDECAR_BYTES)
-    except ConfigError as error:
-        raise VolumeFileError(sidecar, "the geometry of the samples", str(error)) from None
+    from filterlab.io.sidecars import GeometrySidecar, load_sidecar
+
+    found = load_sidecar(sidecar, GeometrySidecar, "the geometry of the samples")
     if found.size[::-1] != shape[-3:]:
         raise VolumeFileError(sidecar, f"size {list(shape[:-4:-1])} as in {path.name}", f"size {list(found.size)}")
     return np.array(found.affine)
@@ -363,6 +350,9 @@ def _described(volume: Volume) -> str | None:
     """The text of a sidecar; None: voxel centres are the integers, and none is needed."""
     if volume.geometry.is_identity:
         return None
+    from filterlab.io.config import dump_config
+    from filterlab.io.sidecars import GeometrySidecar
+
     affine = tuple(map(tuple, volume.affine.tolist()))
     return dump_config(GeometrySidecar(size=volume.size, affine=affine))  # type: ignore[arg-type]
 
