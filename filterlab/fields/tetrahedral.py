@@ -33,6 +33,7 @@ from torch import Tensor
 from filterlab import bernstein, ops
 from filterlab.bernstein import Index, multi_indices
 from filterlab.fields.grid import Coefficients, Evaluation, Term, implementation_of
+from filterlab.fields.trends import Piece, trend
 from filterlab.geometry import Geometry
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.place import Placement
@@ -65,7 +66,7 @@ def weighted(*parts: tuple[Fraction, Mapping[Key, Fraction]]) -> dict[Key, Fract
     return {sample: weight for sample, weight in total.items() if weight}
 
 
-Coordinate = TypeVar("Coordinate", int, Fraction)
+Coordinate = TypeVar("Coordinate", int, float, Fraction)
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,13 @@ class Shape:
     def row(self, alpha: Index, samples: Sequence[Vector]) -> tuple[float, ...]:
         """The weights of a mask, of all of these samples."""
         return tuple(float(self.masks[alpha].get(o, 0)) for o in samples)
+
+    @property
+    def in_numbers(self) -> Piece:
+        """Of samples at whole steps from the centre."""
+        vertices = [(float(x), float(y), float(z)) for x, y, z in self.vertices]
+        masks = {a: {(int(x), int(y), int(z)): float(w) for (x, y, z), w in m.items()} for a, m in self.masks.items()}
+        return vertices, masks
 
     @cached_property
     def barycentric(self) -> tuple[tuple[Fraction, ...], ...]:
@@ -203,7 +211,18 @@ class Spline:
             barycentric=tuple(tuple(tuple(map(float, row)) for row in s.barycentric) for s in self.shapes),
             norm=float(self.norm),
             cuts=tuple((normal, float(d)) for normal, d in sorted(self._cuts())),
+            trend=trend(self.degree, self._pieces) if self.shift == 0 else None,
         )
+
+    @property
+    def _pieces(self) -> list[Piece]:
+        """All tetrahedra of a cell whose centre is a sample."""
+        numbers = [shape.in_numbers for shape in self.shapes]
+        found = []
+        for (vertices, masks), turn in ((numbers[number], turn) for number, turn in self.tetrahedra):
+            turned = {a: {turn(o): w for o, w in mask.items()} for a, mask in masks.items()}
+            found.append(([turn(v) for v in vertices], turned))
+        return found
 
     @property
     def _rules(self) -> list[Mapping[Index, Weights]]:

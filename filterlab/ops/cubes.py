@@ -11,10 +11,11 @@ Loops and memory are a program's own. What is read there, `Sum.restrict` makes t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from filterlab.ops.tetrahedra import Sum, Turned, Value
+from filterlab.ops.stencil import MultiIndex
+from filterlab.ops.tetrahedra import QUADRATICS, UNITS, Block, Sum, Turned, Value
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,50 @@ class Cubes:
         start, end = (self.sum.barycentric(turned, local(self._at(way, t))) for t in (a, z))
         return Part(turned, start, end)
 
+    def trend(self, block: Block, way: Way) -> tuple[list[Value], Value]:
+        """The quadratic near the spline: from where a way begins to where it ends, three Bernstein coefficients.
+
+        With them the most that it is apart from the spline, anywhere in the cube.
+        """
+        e, trend = self.arithmetic, self.spline.trend
+        assert trend is not None
+        numbers = self._sums_and_differences(block)
+        q = {m: self.sum.weighted(self._polar(m, row), numbers) for m, row in zip(QUADRATICS, trend.rows, strict=True)}
+        start, end = way.start, self._at(way, e.constant(1))
+        at_start, at_end = self._linear(q, start), self._linear(q, end)
+        apart = None
+        for row in trend.apart:
+            own = e.absolute(self.sum.weighted(row, numbers))
+            apart = own if apart is None else e.add(apart, own)
+        return [self._affine(*at_start, start), self._affine(*at_start, end), self._affine(*at_end, end)], apart
+
+    def _polar(self, m: MultiIndex, row: Sequence[float]) -> list[float]:
+        """Of a coefficient of q, its share in either argument of the polar form."""
+        return [w if m == (0, 0, 0) or max(m) == 2 else w / 2 for w in row]
+
+    def _linear(self, q: Mapping[MultiIndex, Value], x: Sequence[Value]) -> tuple[Value, list[Value]]:
+        """q's polar form with x in one place: a number and three slopes in the other."""
+        one = [q[unit] for unit in UNITS]
+        slopes = [
+            self._affine(one[i], [q[_sum(unit, other)] for other in UNITS], x) for i, unit in enumerate(UNITS)
+        ]
+        return self._affine(q[0, 0, 0], one, x), slopes
+
+    def _affine(self, number: Value, slopes: Sequence[Value], x: Sequence[Value]) -> Value:
+        for slope, own in zip(slopes, x, strict=True):
+            number = self.arithmetic.multiply_add(slope, own, number)
+        return number
+
+    def _sums_and_differences(self, block: Block) -> list[Value]:
+        """The numbers that `Trend` describes."""
+        e, line = self.arithmetic, dict(block)
+        for axis in range(3):
+            for at in [at for at in line if at[axis] == 0]:
+                low, middle, high = (line[at[:axis] + (k,) + at[axis + 1 :]] for k in range(3))
+                for k, value in enumerate((middle, e.add(low, high), e.subtract(high, low))):
+                    line[at[:axis] + (k,) + at[axis + 1 :]] = value
+        return [line[kinds] for kinds in sorted(line)]
+
     def _at(self, way: Way, t: Value) -> list[Value]:
         """The place at τ = t."""
         e = self.arithmetic
@@ -112,3 +157,8 @@ class Cubes:
             total = c if total is None else e.add(total, c)
         half = e.where(e.less(total, e.constant(0)), e.constant(-0.5), e.constant(0.5))
         return self._turned_round(way, [half] * 3)
+
+
+def _sum(a: MultiIndex, b: MultiIndex) -> MultiIndex:
+    x, y, z = (i + j for i, j in zip(a, b, strict=True))
+    return x, y, z

@@ -18,6 +18,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 from llvmlite import ir
 
@@ -28,7 +29,7 @@ from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, I8, I32, I64, STORAGE, L
 from filterlab.ops.cpu.polynomials import FirstRoot, Part, Rows
 from filterlab.ops.cpu.restriction import Restriction, Section
 from filterlab.ops.cpu.taps import Grid
-from filterlab.ops.cpu.tetrahedral_restriction import TetrahedralRestriction
+from filterlab.ops.cpu.tetrahedral_restriction import Level, TetrahedralRestriction
 from filterlab.ops.raycast import JUMP, REPEATED
 from filterlab.ops.tetrahedra import LoweredStencil, TetrahedralStencil
 
@@ -54,6 +55,7 @@ FIELDS: dict[str, type] = {
     "upper": ctypes.c_void_p,  # (3) d
     "scale": ctypes.c_double,  # f − level is scale · sum + shift
     "shift": ctypes.c_double,
+    "margin": ctypes.c_double,  # that rounding may add to f − level
     "marks": ctypes.c_void_p,  # (bz, by, bx) 16 bits, see `ops.raycast.Raycast`
     **{f"bricks_{a}": ctypes.c_int64 for a in AXES},  # their number
     "edge": ctypes.c_int64,  # of a brick, log₂ of its cells
@@ -136,11 +138,15 @@ class _Program:
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         no_ends = DOUBLE(0.0), DOUBLE(0.0), DOUBLE(0.0)
         grid = Grid(j.width, j.height, I64(0), no_ends, no_ends)
+        self.level = Level(*(e.everywhere(e.scalar(x)) for x in (j.scale, j.shift, j.margin)))
         self.restriction = self._restriction_of(v.stencil, grid)
         self.search = FirstRoot(e, v.degree)
         self.walk = Walk(self.places, j)
         self._ended_at = self.places.variable(self.places.constant(-1))
         self._ended_with = e.variable(e.constant(0))
+        zero = ir.Constant(self.walk.integers, [0] * e.count)
+        self._kept = SimpleNamespace(mask=e.variable(self.walk.mask(False)), cell=[e.variable(zero) for _ in AXES],
+            near=self.places.variable(self.places.constant(0)), far=self.places.variable(self.places.constant(0)))
         self.prepare()
         with frame.every_chunk(e, j) as chunk:
             first = b.mul(chunk, I64(PACKS_OF_A_CHUNK))
@@ -151,7 +157,7 @@ class _Program:
     def _restriction_of(self, stencil: LoweredStencil, grid: Grid) -> Restriction | TetrahedralRestriction:
         e, v = self.lanes, self.variant
         if isinstance(stencil, TetrahedralStencil):
-            return TetrahedralRestriction(e, stencil, self.storage, grid, v.room)
+            return TetrahedralRestriction(e, stencil, self.storage, grid, v.room, self.level)
         return Restriction(e, stencil, v.degree, self.storage, grid, v.room)
 
     def _rays_of(self, pack: Value) -> list[Value]:
@@ -195,13 +201,31 @@ class _Program:
         walk.begin(*(self._vectors(array, rays) for array in (self.job.origins, self.job.directions)))
         going = lambda: e.any(b.and_(walk.going.value, b.not_(self.waiting())))  # noqa: E731
         with e.repeat_while(going):
-            found = walk.next_cells(self.waiting())
+            found = self._next_cells()
             with b.if_then(e.any(found.mask)):
                 start, end = (self._within(found.cell, s) for s in (found.near, found.far))
                 place = self._taps(found.cell), found.cell, start, end, found.mask, self.waiting
                 with self.restriction.every(*place) as section:
                     self.take(rays, self._piece(found, section))
         self.finish(rays)
+
+    def _next_cells(self) -> Found:
+        if not isinstance(self.restriction, TetrahedralRestriction) or self.restriction.near is None:
+            return self.walk.next_cells(self.waiting())
+        e, b, p, kept = self.lanes, self.builder, self.places, self._kept
+        kept.mask.value = self.walk.mask(False)
+        waiting = lambda: b.or_(self.waiting(), kept.mask.value)  # noqa: E731
+        with e.repeat_while(lambda: e.any(b.and_(self.walk.going.value, b.not_(waiting())))):
+            found = self.walk.next_cells(waiting())
+            with b.if_then(e.any(found.mask)):
+                start, end = (self._within(found.cell, s) for s in (found.near, found.far))
+                holds = self.restriction.look(self._taps(found.cell), start, end, found.mask)
+                kept.mask.value = b.or_(kept.mask.value, holds)
+                for variable, own in zip(kept.cell, found.cell, strict=True):
+                    variable.value = b.select(holds, own, variable.value)
+                kept.near.value = p.where(holds, found.near, kept.near.value)
+                kept.far.value = p.where(holds, found.far, kept.far.value)
+        return Found(kept.mask.value, [c.value for c in kept.cell], kept.near.value, kept.far.value)
 
     def _vectors(self, array: Value, rays: Sequence[Value]) -> list[Value]:
         """x, y, z of a pack of rays as doubles."""
@@ -220,8 +244,7 @@ class _Program:
     def _piece(self, found: Found, section: Section) -> Piece:
         e, b, p, v = self.lanes, self.builder, self.places, self.variant
         found = self._of_section(found, section)
-        scale, shift = (e.everywhere(e.scalar(x)) for x in (self.job.scale, self.job.shift))
-        rows = [e.multiply_add(c, scale, shift) for c in section.rows]
+        rows = [e.multiply_add(c, self.level.scale, self.level.shift) for c in section.rows]
         sum_ = rows[0]
         for r in rows[1:]:
             sum_ = e.add(sum_, r)
