@@ -33,12 +33,12 @@ from torch import Tensor
 from filterlab import bernstein, ops
 from filterlab.bernstein import Index, multi_indices
 from filterlab.fields.grid import Coefficients, Evaluation, Term, implementation_of
-from filterlab.fields.trends import Piece, trend
+from filterlab.fields.trends import Input, Piece, on_cubes, on_octahedra
 from filterlab.geometry import Geometry
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.place import Placement
 from filterlab.ops.reference.place import far_voxels
-from filterlab.ops.tetrahedra import Tetrahedra, TetrahedralStencil
+from filterlab.ops.tetrahedra import Tetrahedra, TetrahedralStencil, Trend
 from filterlab.volume import Boundary, all_between
 
 Vector = tuple[Fraction, Fraction, Fraction]
@@ -105,13 +105,6 @@ class Shape:
     def row(self, alpha: Index, samples: Sequence[Vector]) -> tuple[float, ...]:
         """The weights of a mask, of all of these samples."""
         return tuple(float(self.masks[alpha].get(o, 0)) for o in samples)
-
-    @property
-    def in_numbers(self) -> Piece:
-        """Of samples at whole steps from the centre."""
-        vertices = [(float(x), float(y), float(z)) for x, y, z in self.vertices]
-        masks = {a: {(int(x), int(y), int(z)): float(w) for (x, y, z), w in m.items()} for a, m in self.masks.items()}
-        return vertices, masks
 
     @cached_property
     def barycentric(self) -> tuple[tuple[Fraction, ...], ...]:
@@ -211,18 +204,33 @@ class Spline:
             barycentric=tuple(tuple(tuple(map(float, row)) for row in s.barycentric) for s in self.shapes),
             norm=float(self.norm),
             cuts=tuple((normal, float(d)) for normal, d in sorted(self._cuts())),
-            trend=trend(self.degree, self._pieces) if self.shift == 0 else None,
+            trend=self._trend,
         )
 
     @property
+    def _trend(self) -> Trend:
+        return (on_cubes if self.jets is None else on_octahedra)(self.degree, self._pieces)
+
+    @property
     def _pieces(self) -> list[Piece]:
-        """All tetrahedra of a cell whose centre is a sample."""
-        numbers = [shape.in_numbers for shape in self.shapes]
-        found = []
-        for (vertices, masks), turn in ((numbers[number], turn) for number, turn in self.tetrahedra):
-            turned = {a: {turn(o): w for o, w in mask.items()} for a, mask in masks.items()}
-            found.append(([turn(v) for v in vertices], turned))
+        """All that fill the cube about the sample 0."""
+        found, numbers = [], [self._in_numbers(shape) for shape in range(len(self.shapes))]
+        for number, turn, shift in self._about_sample:
+            vertices, masks = numbers[number]
+            moved = {a: _turned_inputs(mask, turn, int(2 * shift)) for a, mask in masks.items()}
+            found.append((np.array([turn(v) for v in vertices]) + float(shift), moved))
         return found
+
+    def _in_numbers(self, number: int) -> Piece:
+        """A shape, and its coefficients by what stands at places of which twice the coordinates are told."""
+        shape = self.shapes[number]
+        jets = self.jets and self.jets[number]
+        inputs = jets or {a: {(o, 0): w for o, w in mask.items()} for a, mask in shape.masks.items()}
+        vertices = np.array(shape.vertices, dtype=float)
+        return vertices, {
+            a: {((int(2 * x), int(2 * y), int(2 * z)), row): float(w) for ((x, y, z), row), w in own.items()}
+            for a, own in inputs.items()
+        }
 
     @property
     def _rules(self) -> list[Mapping[Index, Weights]]:
@@ -239,16 +247,34 @@ class Spline:
     def _cuts(self) -> set[tuple[Normal, Fraction]]:
         """The planes of faces within the cube about the sample 0, in which no tetrahedron lies partly."""
         half, found = Fraction(1, 2), set()
-        for (number, turn), shift in product(self.tetrahedra, {self.shift, -self.shift}):
-            shape = self.shapes[number]
-            if all(abs(c + shift) <= half for v in shape.vertices for c in turn(v)):
-                for row in shape.barycentric:
-                    normal, d = primitive(row)
-                    normal = turn(normal)
-                    plane = upright(normal, sum(normal) * shift - d)
-                    if sum(map(abs, normal)) > 1 or abs(plane[1]) < half:
-                        found.add(plane)
+        for number, turn, shift in self._about_sample:
+            for row in self.shapes[number].barycentric:
+                normal, d = primitive(row)
+                normal = turn(normal)
+                plane = upright(normal, sum(normal) * shift - d)
+                if sum(map(abs, normal)) > 1 or abs(plane[1]) < half:
+                    found.add(plane)
         return found
+
+    @cached_property
+    def _about_sample(self) -> list[tuple[int, Turn, Fraction]]:
+        """Which tetrahedra fill the cube about the sample 0, and the place of their cells' centres along every axis."""
+        return [
+            (number, turn, shift)
+            for (number, turn), shift in product(self.tetrahedra, sorted({self.shift, -self.shift}))
+            if all(abs(c + shift) <= Fraction(1, 2) for v in self.shapes[number].vertices for c in turn(v))
+        ]
+
+
+def _turned_inputs(mask: Mapping[Input, float], turn: Turn, shift: int) -> dict[Input, float]:
+    """What stands at places, turned and moved, slopes with them."""
+    found = {}
+    for (place, row), weight in mask.items():
+        x, y, z = turn(place)
+        axis = turn.ranks.index(row - 1) if row else -1
+        sign = turn.signs[axis] if row else 1
+        found[(x + shift, y + shift, z + shift), axis + 1] = sign * weight
+    return found
 
 
 def _place(sample: Vector) -> tuple[int, int, int]:

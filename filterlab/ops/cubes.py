@@ -13,9 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from filterlab.ops.stencil import MultiIndex
-from filterlab.ops.tetrahedra import QUADRATICS, UNITS, Block, Sum, Turned, Value
+from filterlab.ops.tetrahedra import QUADRATICS, UNITS, Block, Sum, Turned, Value, at_centre
 
 
 @dataclass(frozen=True)
@@ -75,10 +76,14 @@ class Cubes:
     def following(self, cuts: Sequence[Value], a: Value) -> Value:
         """The next τ behind a where a plane is met, or 1."""
         e = self.arithmetic
-        found = e.constant(1)
-        for met in cuts:
-            found = e.where(e.both(e.less(a, met), e.less(met, found)), met, found)
-        return found
+        one = e.constant(1)
+        ahead = [e.where(e.less(a, met), met, one) for met in cuts]
+        while len(ahead) > 1:  # in pairs: none waits for all before it
+            ahead = [self._lesser(*ahead[i : i + 2]) for i in range(0, len(ahead), 2)]
+        return self._lesser(ahead[0], one)
+
+    def _lesser(self, a: Value, b: Value | None = None) -> Value:
+        return a if b is None else self.arithmetic.where(self.arithmetic.less(a, b), a, b)
 
     def part(self, way: Way, a: Value, z: Value) -> Part:
         """From τ = a to z, between which no plane is met."""
@@ -94,16 +99,18 @@ class Cubes:
         start, end = (self.sum.barycentric(turned, local(self._at(way, t))) for t in (a, z))
         return Part(turned, start, end)
 
-    def trend(self, block: Block, way: Way) -> tuple[list[Value], Value]:
+    def trend(self, blocks: Sequence[Block], way: Way) -> tuple[list[Value], Value]:
         """The quadratic near the spline: from where a way begins to where it ends, three Bernstein coefficients.
 
         With them the most that it is apart from the spline, anywhere in the cube.
+
+        Args:
+            blocks: the samples around the one in the middle; or those around `Trend.centres`, along the axes of space.
         """
         e, trend = self.arithmetic, self.spline.trend
-        assert trend is not None
-        numbers = self._sums_and_differences(block)
+        numbers = self._of_centres(blocks, way) if way.odd else self._of_samples(blocks[0])
         q = {m: self.sum.weighted(self._polar(m, row), numbers) for m, row in zip(QUADRATICS, trend.rows, strict=True)}
-        start, end = way.start, self._at(way, e.constant(1))
+        start, end = (self._turned_round(way, x) for x in (way.start, self._at(way, e.constant(1))))
         at_start, at_end = self._linear(q, start), self._linear(q, end)
         apart = None
         for row in trend.apart:
@@ -128,8 +135,18 @@ class Cubes:
             number = self.arithmetic.multiply_add(slope, own, number)
         return number
 
-    def _sums_and_differences(self, block: Block) -> list[Value]:
-        """The numbers that `Trend` describes."""
+    def _of_centres(self, blocks: Sequence[Block], way: Way) -> list[Value]:
+        """The numbers that `Trend` describes, of octahedra."""
+        e, numbers = self.arithmetic, []
+        for block in blocks:
+            value, *slopes = at_centre(e, block).values()
+            numbers.append([value, *self._turned_round(way, slopes)])
+        half = len(blocks) // 2
+        opposite = list(zip(chain(*numbers[:half]), chain(*numbers[half:]), strict=True))
+        return [write(a, b) for write in (e.add, e.subtract) for a, b in opposite]
+
+    def _of_samples(self, block: Block) -> list[Value]:
+        """The numbers that `Trend` describes, of cubes."""
         e, line = self.arithmetic, dict(block)
         for axis in range(3):
             for at in [at for at in line if at[axis] == 0]:

@@ -67,15 +67,19 @@ class Arithmetic(Protocol):
 class Trend:
     """A quadratic q near a spline on the cube about a sample, and how near.
 
-    Of the 27 numbers that samples there are by their sums and differences: along each axis, x first, the middle one,
-    the sum of the other two, the one ahead less the one behind.
+    Of cubes both are made of the 27 numbers that samples are by their sums and differences: along each axis, x first,
+    the middle one, the sum of the other two, the one ahead less the one behind. Of octahedra, of what `at_centre` tells
+    of eight centres, along axes turned round where the sample's index is odd: for each of four centres the sums of its
+    value and slopes and those of the centre opposite; then so the differences.
 
     Attributes:
+        centres: twice their places, from a sample at even indices, those opposite last; none of cubes.
         rows: of q's coefficients of `QUADRATICS` in the place from the sample; the weights of these numbers.
         apart: rows of weights as well: |f − q| is nowhere in the cube greater than the sum of what they give, each made
             positive.
     """
 
+    centres: tuple[Steps, ...]
     rows: tuple[tuple[float, ...], ...]
     apart: tuple[tuple[float, ...], ...]
 
@@ -100,7 +104,7 @@ class Tetrahedra:
         norm: no value is larger than this times the largest sample.
         cuts: planes (n, d), n · v = d, that cut the cube |v| ≤ ½ about a sample into parts of one tetrahedron each; of
             octahedra about a sample at even indices, v turned round along the axes of odd ones.
-        trend: None: there is none.
+        trend: what is near it.
     """
 
     octahedral: bool
@@ -113,7 +117,7 @@ class Tetrahedra:
     barycentric: tuple[tuple[tuple[float, ...], ...], ...]
     norm: float
     cuts: tuple[tuple[Steps, float], ...]
-    trend: Trend | None = None
+    trend: Trend
 
     @cached_property
     def shared(self) -> tuple[tuple[tuple[int, int, int], ...], tuple[tuple[float, ...], ...]]:

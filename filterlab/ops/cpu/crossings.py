@@ -210,7 +210,7 @@ class _Program:
         self.finish(rays)
 
     def _next_cells(self) -> Found:
-        if not isinstance(self.restriction, TetrahedralRestriction) or self.restriction.near is None:
+        if not isinstance(self.restriction, TetrahedralRestriction):
             return self.walk.next_cells(self.waiting())
         e, b, p, kept = self.lanes, self.builder, self.places, self._kept
         kept.mask.value = self.walk.mask(False)
@@ -219,7 +219,7 @@ class _Program:
             found = self.walk.next_cells(waiting())
             with b.if_then(e.any(found.mask)):
                 start, end = (self._within(found.cell, s) for s in (found.near, found.far))
-                holds = self.restriction.look(self._taps(found.cell), start, end, found.mask)
+                holds = self.restriction.look(self._taps(found.cell), found.cell, start, end, found.mask)
                 kept.mask.value = b.or_(kept.mask.value, holds)
                 for variable, own in zip(kept.cell, found.cell, strict=True):
                     variable.value = b.select(holds, own, variable.value)

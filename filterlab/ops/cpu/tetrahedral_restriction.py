@@ -17,7 +17,7 @@ from filterlab.ops.cpu.lanes import I1, I64, Lanes, Storage, Value, Variable
 from filterlab.ops.cpu.restriction import Section
 from filterlab.ops.cpu.taps import Grid
 from filterlab.ops.cpu.tetrahedra import TetrahedralTaps
-from filterlab.ops.cubes import Cubes
+from filterlab.ops.cubes import Cubes, Way
 from filterlab.ops.tetrahedra import TetrahedralStencil
 
 
@@ -91,18 +91,19 @@ class TetrahedralRestriction:
         self.spline, self.cubes = stencil.spline, Cubes(self.taps.sum)
         self._cuts = [lanes.variable(lanes.constant(0)) for _ in self.spline.cuts]
         self._at = lanes.variable(lanes.constant(0))
-        self.near = NearLevel(lanes, level) if self.spline.trend is not None else None
+        self.near = NearLevel(lanes, level)
 
-    def look(self, taps: list[Value], start: Sequence[Value], end: Sequence[Value], mask: Value) -> Value:
+    def look(
+        self, taps: list[Value], cell: Sequence[Value], start: Sequence[Value], end: Sequence[Value], mask: Value
+    ) -> Value:
         """A mask: which of the lanes under another may meet the level in their cubes; what is known of them is kept.
 
         Args: as of `every`.
         """
-        if self.near is None:
-            return mask
         e, b = self.lanes, self.builder
-        (block,) = self.taps.blocks(taps, self.taps.at_sample(None), I64(0))
-        rows, apart = self.cubes.trend(block, self.cubes.way(start, end, []))
+        way = self._way(cell, start, end)
+        corners = self.taps.around_sample(way.odd) if way.odd else self.taps.at_sample(None)
+        rows, apart = self.cubes.trend(self.taps.blocks(taps, corners, I64(0)), way)
         self.near.keep(mask, rows, apart)
         return b.and_(mask, self.near.may_hold(e.constant(0), e.constant(1)))
 
@@ -118,8 +119,7 @@ class TetrahedralRestriction:
     ) -> Iterator[Section]:
         """The with-block for the next part of every lane under the mask, until it waits; see `Restriction.every`."""
         e, b = self.lanes, self.builder
-        odd = [b.trunc(index, ir.VectorType(I1, e.count)) for index in cell] if self.spline.octahedral else []
-        way = self.cubes.way(start, end, odd)
+        way = self._way(cell, start, end)
         same = None if self.spline.octahedral else self.taps.blocks(taps, self.taps.at_sample(None), I64(0))
         for kept, cut in zip(self._cuts, self.cubes.cuts(way), strict=True):
             kept.value = cut
@@ -133,12 +133,14 @@ class TetrahedralRestriction:
             self._at.value = z
             on.value = b.and_(b.and_(on.value, e.less(z, e.constant(1))), b.not_(waiting()))
 
+    def _way(self, cell: Sequence[Value], start: Sequence[Value], end: Sequence[Value]) -> Way:
+        odd = [self.builder.trunc(index, ir.VectorType(I1, self.lanes.count)) for index in cell]
+        return self.cubes.way(start, end, odd)
+
     def _next_part(self, on: Variable) -> tuple[Value, Value, Value]:
         """From where to where the next part is, and in which lanes there is one."""
         e, b, near = self.lanes, self.builder, self.near
         cuts = [cut.value for cut in self._cuts]
-        if near is None:
-            return self._at.value, self.cubes.following(cuts, self._at.value), on.value
         end, left = e.variable(e.constant(1)), e.variable(on.value)
         with e.repeat_while(lambda: e.any(left.value)):
             a = self._at.value
