@@ -223,14 +223,14 @@ class Spline:
 
     def _in_numbers(self, number: int) -> Piece:
         """A shape, and its coefficients by what stands at places of which twice the coordinates are told."""
-        shape = self.shapes[number]
-        jets = self.jets and self.jets[number]
-        inputs = jets or {a: {(o, 0): w for o, w in mask.items()} for a, mask in shape.masks.items()}
-        vertices = np.array(shape.vertices, dtype=float)
-        return vertices, {
-            a: {((int(2 * x), int(2 * y), int(2 * z)), row): float(w) for ((x, y, z), row), w in own.items()}
-            for a, own in inputs.items()
-        }
+        shape, inputs = self.shapes[number], {}
+        if self.jets is None:
+            for a, mask in shape.masks.items():
+                inputs[a] = {((int(2 * x), int(2 * y), int(2 * z)), 0): float(w) for (x, y, z), w in mask.items()}
+        else:
+            for a, jets in self.jets[number].items():
+                inputs[a] = {((2 * x, 2 * y, 2 * z), row): float(w) for ((x, y, z), row), w in jets.items()}
+        return np.array(shape.vertices, dtype=float), inputs
 
     @property
     def _rules(self) -> list[Mapping[Index, Weights]]:

@@ -42,7 +42,7 @@ def on_cubes(degree: int, pieces: Sequence[Piece]) -> Trend:
     """Of a spline with these pieces in a cube, each a sum over the 3³ samples around."""
     kinds = np.array(list(product(range(3), repeat=3)))
     classes = [np.all((kinds == 2) == parity, axis=1) for parity in product((False, True), repeat=3)]
-    rows = _rows(pieces, [(place, 0) for place in product((-2, 0, 2), repeat=3)])
+    rows = _rows(pieces, [((x, y, z), 0) for x, y, z in product((-2, 0, 2), repeat=3)])
     return _trend(degree, pieces, rows @ np.kron(np.kron(_OF_KIND, _OF_KIND), _OF_KIND).T, classes, ())
 
 

@@ -5,7 +5,8 @@ together for longer, and take a tenth less time than P of one row (Marschner-Lob
 
 For a pack of P rays, until all have ended:
 
-    walk        every ray to its next cell that may hold the level (`ops.cpu.cells`)
+    walk        every ray to its next cell that may hold the level (`ops.cpu.cells`); of splines on tetrahedra every one
+                that does, of which a quadratic near the spline leaves over one in four
     restrict    the sum over taps on the ray's part in that cell, P at a time (`ops.cpu.restriction`)
     signs       one change of sign among the coefficients of f − level: there is the hit, the ray waits for the end
                 several: the part that holds the first root is looked for at once (`ops.cpu.polynomials`)
@@ -18,12 +19,11 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 from llvmlite import ir
 
 from filterlab.ops.cpu import frame, job
-from filterlab.ops.cpu.cells import Found, Walk
+from filterlab.ops.cpu.cells import Found, Gathered, Walk
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, I8, I32, I64, STORAGE, Lanes, Value
 from filterlab.ops.cpu.polynomials import FirstRoot, Part, Rows
@@ -144,9 +144,7 @@ class _Program:
         self.walk = Walk(self.places, j)
         self._ended_at = self.places.variable(self.places.constant(-1))
         self._ended_with = e.variable(e.constant(0))
-        zero = ir.Constant(self.walk.integers, [0] * e.count)
-        self._kept = SimpleNamespace(mask=e.variable(self.walk.mask(False)), cell=[e.variable(zero) for _ in AXES],
-            near=self.places.variable(self.places.constant(0)), far=self.places.variable(self.places.constant(0)))
+        self._gathered = Gathered(self.places)
         self.prepare()
         with frame.every_chunk(e, j) as chunk:
             first = b.mul(chunk, I64(PACKS_OF_A_CHUNK))
@@ -202,30 +200,30 @@ class _Program:
         going = lambda: e.any(b.and_(walk.going.value, b.not_(self.waiting())))  # noqa: E731
         with e.repeat_while(going):
             found = self._next_cells()
-            with b.if_then(e.any(found.mask)):
-                start, end = (self._within(found.cell, s) for s in (found.near, found.far))
-                place = self._taps(found.cell), found.cell, start, end, found.mask, self.waiting
-                with self.restriction.every(*place) as section:
-                    self.take(rays, self._piece(found, section))
+            with (
+                b.if_then(e.any(found.mask)),
+                self.restriction.every(*self._place(found), found.mask, self.waiting) as section,
+            ):
+                self.take(rays, self._piece(found, section))
         self.finish(rays)
 
     def _next_cells(self) -> Found:
+        """To the next cell of every ray that may hold the level; of splines on tetrahedra, that does near its way."""
         if not isinstance(self.restriction, TetrahedralRestriction):
             return self.walk.next_cells(self.waiting())
-        e, b, p, kept = self.lanes, self.builder, self.places, self._kept
-        kept.mask.value = self.walk.mask(False)
-        waiting = lambda: b.or_(self.waiting(), kept.mask.value)  # noqa: E731
+        e, b, gathered = self.lanes, self.builder, self._gathered
+        gathered.clear()
+        waiting = lambda: b.or_(self.waiting(), gathered.mask)  # noqa: E731
         with e.repeat_while(lambda: e.any(b.and_(self.walk.going.value, b.not_(waiting())))):
             found = self.walk.next_cells(waiting())
             with b.if_then(e.any(found.mask)):
-                start, end = (self._within(found.cell, s) for s in (found.near, found.far))
-                holds = self.restriction.look(self._taps(found.cell), found.cell, start, end, found.mask)
-                kept.mask.value = b.or_(kept.mask.value, holds)
-                for variable, own in zip(kept.cell, found.cell, strict=True):
-                    variable.value = b.select(holds, own, variable.value)
-                kept.near.value = p.where(holds, found.near, kept.near.value)
-                kept.far.value = p.where(holds, found.far, kept.far.value)
-        return Found(kept.mask.value, [c.value for c in kept.cell], kept.near.value, kept.far.value)
+                gathered.add(self.restriction.look(*self._place(found), found.mask), found)
+        return gathered.found
+
+    def _place(self, found: Found) -> tuple[list[Value], list[Value], list[Value], list[Value]]:
+        """First taps, cells, and where rays enter and leave them."""
+        start, end = (self._within(found.cell, s) for s in (found.near, found.far))
+        return self._taps(found.cell), found.cell, start, end
 
     def _vectors(self, array: Value, rays: Sequence[Value]) -> list[Value]:
         """x, y, z of a pack of rays as doubles."""

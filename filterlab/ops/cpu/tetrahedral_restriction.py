@@ -1,8 +1,15 @@
 """Splines on tetrahedra along rays, a cube about a sample at a time: what `restriction` is for sums over taps.
 
-The parts of `ops.cubes` are met in order, one in each lane, until all lanes are through or need not go on:
+A cube is looked at first: how near a quadratic comes to the level along the ray, and whether the spline may be so much
+apart from it (`ops.tetrahedra.Trend`). Of four cubes that may hold the level three are left out so (Marschner-Lobb
+128³, level ½), and most tetrahedra of the others. In a cube that is left the parts of `ops.cubes` are met in order, one
+in each lane, until all lanes are through or need not go on:
 
-    next plane ahead ─▶ the part's middle, turned ─▶ coefficients of its tetrahedron ─▶ the blossom at both ends
+    next plane ahead, behind which the level may be ─▶ the part's middle, turned ─▶ coefficients of its tetrahedron
+      ─▶ the blossom at both ends
+
+A part that is left out is farther from the level than rounding reaches, at its ends too: no crossing between it and the
+next one is lost.
 """
 
 from __future__ import annotations
