@@ -39,8 +39,10 @@ _NAMES = (
     "partitions",
     "prefilters_on_tetrahedra",
     "tetrahedral_table",
+    "terrain_error",
     "terrain_roots",
     "terrain_frames",
+    "quadrics_tables",
     "demo",
 )
 

@@ -251,10 +251,10 @@ def integer(path: Path, what: str, text: str) -> int:
     return int(text)
 
 
-def regular_file(path: Path) -> Path:
+def regular_file(path: Path, what: str = "a volume file") -> Path:
     """The path, if it is a file (no folder, pipe or device). Raises FileNotFoundError or VolumeFileError."""
     if not path.exists():
-        raise FileNotFoundError(f"{path}: expected a volume file; got no file of this name")
+        raise FileNotFoundError(f"{path}: expected {what}; got no file of this name")
     if not path.is_file():
         raise VolumeFileError(path, "a file", "a folder, pipe or device")
     return path
