@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from math import comb, perm
 
 import torch
@@ -68,7 +68,7 @@ class Triangle:
     samples: tuple[tuple[int, int], ...]
     weights: tuple[tuple[float, ...], ...]
 
-    @property
+    @cached_property
     def first(self) -> int:
         """Which of the data stands at V0, or weighs most there."""
         return max(range(len(self.samples)), key=lambda k: self.weights[0][k])
@@ -91,17 +91,21 @@ class Pattern:
     up: Triangle
     down: Triangle
 
+    def __hash__(self) -> int:
+        """Of the few patterns there are; those of hundreds of weights would be taken at every call of a program."""
+        return hash((self.name, self.diagonal, self.steps, len(self.up.samples)))
+
     @property
     def mirrored(self) -> bool:
         """Whether s is taken from the other end."""
         return self.diagonal == "main"
 
-    @property
+    @cached_property
     def offsets(self) -> tuple[tuple[int, int], ...]:
         """(a, b) of the data of `up`: a steps from V0 towards V1, b towards V2; the same of both triangles."""
         return tuple((self.steps - a if self.mirrored else a, b) for a, b in self.up.samples)
 
-    @property
+    @cached_property
     def reach(self) -> int:
         """How many steps beyond a cell its data are."""
         return max(max(-a, -b, a - self.steps, b - self.steps) for a, b in self.offsets)
