@@ -40,6 +40,7 @@ _NAMES = (
     "prefilters_on_tetrahedra",
     "tetrahedral_table",
     "terrain_error",
+    "quadrics_tables",
     "demo",
 )
 
