@@ -35,6 +35,7 @@ from filterlab.ops import heights as described
 from filterlab.ops.differentiable import height_hits as ops
 from filterlab.ops.differentiable import heights as jets
 from filterlab.ops.reference import heights as reference
+from filterlab.surfaces import sight
 from filterlab.surfaces.base import Hits, Surface, all_finite, check_rays
 from filterlab.surfaces.level_set import RAYS_AT_ONCE
 from filterlab.surfaces.quartic import quartic_spline
@@ -130,6 +131,63 @@ class HeightField(Surface):
         if points.shape[-1] != 2:
             raise ValueError(f"points must have shape (..., 2): x, y; got {tuple(points.shape)}")
         return Relief(*self._explicit(points, order))
+
+    @property
+    def places(self) -> Tensor:
+        """(H, W, 2) float64: x and y of all data in the world."""
+        rows, columns = (torch.arange(n, device=self.device, dtype=torch.float64) for n in self.heights.shape[-2:])
+        x, y = (o + d * n for o, d, n in zip(self.origin, self.spacing, (columns, rows), strict=True))
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+
+    def viewshed(
+        self,
+        observer: Array | Sequence[float],
+        height: float = 1.7,
+        target: float = 0.0,
+        points: Array | None = None,
+        *,
+        earth_radius: float | None = None,
+        refraction: float = sight.REFRACTION,
+    ) -> Tensor:
+        """Which places an observer sees: those to whom the straight line meets no ground before its last 10⁻⁹.
+
+        Args:
+            observer: x, y in the world, (2,), over the domain.
+            height: of the eye above the ground there, in the unit of the heights.
+            target: of what is looked at above the ground.
+            points: (*P, 2), x and y; None: all data, (H, W).
+            earth_radius: R, in the unit of heights, x and y: ground at a distance d lies (1 − k) d² / (2 R) lower.
+                `surfaces.sight.EARTH_RADIUS` is that in metres. None: a flat earth.
+            refraction: k.
+
+        Returns:
+            (*P) bool; False in holes. Nothing is recorded.
+
+        Raises:
+            ValueError: an observer in a hole, or of another shape; a radius that is not positive.
+        """
+        return sight.viewshed(self, observer, height, target, points, earth_radius, refraction)
+
+    def horizon(
+        self,
+        observer: Array | Sequence[float],
+        azimuths: Array | Sequence[float],
+        height: float = 1.7,
+        *,
+        earth_radius: float | None = None,
+        refraction: float = sight.REFRACTION,
+    ) -> Tensor:
+        """The angle above the horizontal, in radians, over which an observer sees no ground, for every azimuth.
+
+        Args:
+            azimuths: (*P) radians from +y towards +x: clockwise from north, where y goes there.
+            observer, height, earth_radius, refraction: as for `viewshed`, which raises the same.
+
+        Returns:
+            (*P) float64, found by halving to the last bit; where there is nothing but the end of the grid, the angle to
+            that end.
+        """
+        return sight.horizon(self, observer, azimuths, height, earth_radius, refraction)
 
     def _explicit(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         n = self.heights.shape[0] if self.batched else 1

@@ -1,6 +1,6 @@
 """What can be seen from a place of a terrain: viewsheds and horizons, by rays at the spline itself.
 
-On a round earth the ground falls off below the horizontal plane through the observer, by d² / (2 R) at a distance d, and
+On a round earth the ground falls off below the horizontal plane through the observer, by d² / (2 R) at a distance d;
 light that is bent downwards by refraction shows k of that less: heights count as h − (1 − k) d² / (2 R), and sight is
 straight. Splines that reproduce quadratic polynomials follow that exactly; c2 without prefilter is off by one number
 everywhere, observer included; linear by (1 − k) m² / (8 R) at most, for steps of m.
@@ -11,6 +11,7 @@ Source: the correction for curvature and refraction of levelling, as GIS apply i
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -35,7 +36,7 @@ _HALVINGS = 60  # of the angle from the nadir to the zenith
 
 def viewshed(
     surface: HeightField,
-    observer: Array,
+    observer: Array | Sequence[float],
     height: float,
     target: float,
     points: Array | None,
@@ -66,8 +67,8 @@ def _seen(ground: HeightField, eye: Tensor, places: Tensor, target: float, imple
 
 def horizon(
     surface: HeightField,
-    observer: Array,
-    azimuths: Array,
+    observer: Array | Sequence[float],
+    azimuths: Array | Sequence[float],
     height: float,
     earth_radius: float | None,
     refraction: float,
@@ -77,7 +78,7 @@ def horizon(
     place = _observer(surface, observer)
     ground = _lowered(surface, place, earth_radius, refraction)
     eye = _above(ground, place, height)
-    azimuths = as_tensor(azimuths).detach().double()
+    azimuths = torch.as_tensor(azimuths, dtype=torch.float64).detach().to(surface.device)
     turn = azimuths.reshape(-1)
     low, high = torch.full_like(turn, -math.pi / 2), torch.full_like(turn, math.pi / 2)
     for _ in range(_HALVINGS):
@@ -89,11 +90,11 @@ def horizon(
     return ((low + high) / 2).reshape(azimuths.shape)
 
 
-def _observer(surface: HeightField, observer: Array) -> Tensor:
-    place = as_tensor(observer)
-    if not isinstance(place, Tensor) or place.shape != (2,):
+def _observer(surface: HeightField, observer: Array | Sequence[float]) -> Tensor:
+    place = torch.as_tensor(observer, dtype=torch.float64)
+    if place.shape != (2,):
         raise ValueError(f"observer must be x, y in the world, of shape (2,); got {tuple(place.shape)}")
-    place = place.detach().to(surface.device, torch.float64)
+    place = place.detach().to(surface.device)
     if not bool(surface.jet(place, 0)[0].isfinite()):
         raise ValueError(f"observer must stand on the ground; got {place.tolist()}, in a hole")
     return place
