@@ -103,9 +103,9 @@ def _candidates_of_part(given: HeightHits, origins: Tensor, directions: Tensor, 
         keep = found.holds
         line = found.line[:, None].expand_as(keep)[keep]
         length = own.length[line]
-        places = length * own.start[line], *(length * x[keep] for x in (found.near, found.far))
-        rows = found.coefficients[keep], torch.zeros_like(line, dtype=torch.bool), found.repeated[keep]
-        parts.append(Candidates(own.ray[line] + before, *places, *rows))
+        start, near, far = length * own.start[line], length * found.near[keep], length * found.far[keep]
+        c, jump, repeated = found.coefficients[keep], torch.zeros_like(line, dtype=torch.bool), found.repeated[keep]
+        parts.append(Candidates(own.ray[line] + before, start, near, far, c, jump, repeated))
         return torch.zeros_like(found.line, dtype=torch.bool)
 
     walk(given, own.lines, take)
