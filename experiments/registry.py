@@ -40,6 +40,8 @@ _NAMES = (
     "prefilters_on_tetrahedra",
     "tetrahedral_table",
     "terrain_error",
+    "terrain_roots",
+    "terrain_frames",
     "quadrics_tables",
     "demo",
 )
