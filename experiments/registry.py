@@ -39,6 +39,7 @@ _NAMES = (
     "partitions",
     "prefilters_on_tetrahedra",
     "tetrahedral_table",
+    "terrain_error",
     "demo",
 )
 

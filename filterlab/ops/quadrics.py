@@ -13,7 +13,7 @@ and β² − αγ loses no digits to the distance of the eye. The ball is |ρ| �
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -34,19 +34,40 @@ PLANES = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Quadrics:
-    """M quadrics in balls cut by planes.
+class InLeaves:
+    """M surfaces in the leaves of a tree, all of one kind.
 
     Attributes:
+        op: what finds hits of that kind.
         tree: where they are; leaves have eight places.
-        leaves: (G, 16 + 4 H, 8) float64, for every place: A, b, c; the ball's centre from the tree's, r²; |A|, |b|;
-            n, d of H planes n·q + d ≤ 0. Of places without a quadric NaN.
+        leaves: (G, K, 8) float64, for every place K numbers; of places without a surface NaN.
         faces: of which hits there are: "front", where F goes from + to − along the ray, "back" or "both".
     """
 
+    op: ClassVar[str]
     tree: Tree
     leaves: Tensor
     faces: str = "both"
+
+    def some(self, kept: Tensor) -> Self:
+        """Those of a mask (M,); they keep their numbers, and hits with them every bit."""
+        rows = self.leaves.transpose(1, 2).flatten(0, 1)[: len(self.tree.order)]
+        return type(self)(self.tree.some(kept), in_leaves(rows[kept[self.tree.order]], torch.nan), self.faces)
+
+    def kept(self, reversed: bool) -> Kept:
+        """Which hits count of rays that go as directions say, or the other way round."""
+        falls, rises = self.faces != "back", self.faces != "front"
+        return Kept(*((rises, falls) if reversed else (falls, rises)), falls)
+
+
+@dataclass(frozen=True, eq=False)
+class Quadrics(InLeaves):
+    """M quadrics in balls cut by planes.
+
+    Leaves have 16 + 4 H rows: A, b, c; the ball's centre from the tree's, r²; |A|, |b|; n, d of H planes n·q + d ≤ 0.
+    """
+
+    op = "quadrics"
 
     @classmethod
     def of(
@@ -67,20 +88,10 @@ class Quadrics:
         rows = torch.cat((entries, vector, constant[:, None], ball, sizes, planes.flatten(1)), 1)
         return cls(tree, in_leaves(rows[order], torch.nan), faces)
 
-    def some(self, kept: Tensor) -> Quadrics:
-        """Those of a mask (M,); they keep their numbers, and hits with them every bit."""
-        rows = self.leaves.transpose(1, 2).flatten(0, 1)[: len(self.tree.order)]
-        return Quadrics(self.tree.some(kept), in_leaves(rows[kept[self.tree.order]], torch.nan), self.faces)
-
     @property
     def planes(self) -> int:
         """H."""
         return (self.leaves.shape[1] - PLANES) // 4
-
-    def kept(self, reversed: bool) -> Kept:
-        """Which hits count of rays that go as directions say, or the other way round."""
-        falls, rises = self.faces != "back", self.faces != "front"
-        return Kept(*((rises, falls) if reversed else (falls, rises)), falls)
 
 
 class Kept(NamedTuple):

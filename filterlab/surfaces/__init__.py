@@ -2,6 +2,7 @@
 
     Field ────────────▶ LevelSet ──hit(rays)──▶ Hits ──at(rays, hits)──▶ points, normals, curvatures
     A, b, c in bounds ▶ Quadrics ──────┤
+    corners ──▶ BilinearQuads ─────────┤
     heights on a grid ▶ HeightField ───┘
                         LevelSet ──mesh(…)────▶ triangles
 
@@ -10,6 +11,7 @@ once (`surfaces.base`).
 """
 
 from filterlab.surfaces.base import Hits, Surface, SurfacePoints
+from filterlab.surfaces.bilinear import BilinearQuads
 from filterlab.surfaces.bounds import Bounds, Planes, Spheres, Tetrahedra
 from filterlab.surfaces.height_field import HeightField
 from filterlab.surfaces.level_set import LevelSet
@@ -18,6 +20,7 @@ from filterlab.surfaces.quadrics import Quadrics
 from filterlab.surfaces.relief import Relief
 
 __all__ = [
+    "BilinearQuads",
     "Bounds",
     "HeightField",
     "Hits",

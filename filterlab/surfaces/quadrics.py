@@ -23,20 +23,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from filterlab.fields.base import Domain
 from filterlab.ops import quadrics as described
-from filterlab.ops.differentiable import quadrics as ops
 from filterlab.surfaces import quadric_kinds as kinds
-from filterlab.surfaces.base import Hits, Surface
 from filterlab.surfaces.bounds import Bounds, check_rows
+from filterlab.surfaces.in_tree import InTree, domain_around
 
 _ROUNDINGS = 16  # of the largest coordinate, by which bounds are larger: neighbours that share a face leave no gap
 _SEEN = 1e-12  # of the terms of a test, by which it has to fail
-_MARGIN = 1e-4  # of the diagonal, around all: rays begin outside of what they hit
-_FINEST = 1e-3  # of the diagonal: as the smallest radius counts what is smaller
 
 
-class Quadrics(Surface):
+class Quadrics(InTree):
     """Surfaces y·A y + 2 b·y + c = 0, y = x − o, each within its bounds.
 
     Args:
@@ -55,9 +51,6 @@ class Quadrics(Surface):
         TypeError, ValueError: no such tensors, or of other lengths or devices; numbers that are not finite; A and b
             that are both 0, of which nothing is a surface.
     """
-
-    max_order = 2
-    in_pieces = True
 
     def __init__(
         self,
@@ -80,8 +73,7 @@ class Quadrics(Surface):
         self.origins = b.new_zeros(count, 3) if origins is None else check_rows("origins", origins, (count, 3))
         self.bounds, self.faces = bounds if cuts is None else bounds.cut(cuts), faces
         self._check()
-        self.domain = _domain(self.bounds)
-        self._built: tuple[tuple[int, ...], described.Quadrics] | None = None
+        self.domain = domain_around(self.bounds.boxes, self.bounds.radii)
 
     def _check(self) -> None:
         if not len(self):
@@ -199,28 +191,7 @@ class Quadrics(Surface):
     def device(self) -> torch.device:
         return self.bounds.centers.device
 
-    @property
-    def detached(self) -> Quadrics:
-        other = self.with_tensors([x.detach() for x in self.tensors])
-        other._built = tuple(x._version for x in other.tensors), self._cast
-        return other
-
-    def _first(self, origins: Tensor, directions: Tensor) -> Hits:
-        t, piece = ops.hits(self._cast, origins.reshape(-1, 3), directions.reshape(-1, 3), 1)
-        return Hits(t[:, 0], piece[:, 0])
-
-    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        return Hits(*ops.hits(self._cast, origins, directions, sheets, farthest))
-
     # --- what is cast ---
-
-    @property
-    def _cast(self) -> described.Quadrics:
-        """The index and the numbers in it, as they are now."""
-        versions = tuple(x._version for x in self.tensors)
-        if self._built is None or self._built[0] != versions:
-            self._built = versions, self._described()
-        return self._built[1]
 
     def _described(self) -> described.Quadrics:
         bounds, (lower, upper) = self.bounds, self.bounds.boxes.around()
@@ -250,10 +221,7 @@ class Quadrics(Surface):
         """
         if self.faces == "both":
             return self
-        found = self._cast.some(self._facing(eye.detach().to(self.bounds.centers)))
-        other = copy.copy(self)
-        other._built = tuple(x._version for x in self.tensors), found
-        return other
+        return self._casting(self._cast.some(self._facing(eye.detach().to(self.bounds.centers))))
 
     def _facing(self, eye: Tensor) -> Tensor:
         """(M,) whether some point of the bounds may face it."""
@@ -268,12 +236,3 @@ class Quadrics(Surface):
             reach = torch.minimum(reach, (corners * polar[:, None]).sum(-1).amax(1))
         size = c.abs() + own.abs() + reach.abs()
         return c + own + reach >= -_SEEN * size
-
-
-def _domain(bounds: Bounds) -> Domain:
-    """A box around all, with room; the smallest radius stands for a voxel."""
-    lower, upper = (x.cpu() for x in bounds.boxes.around())
-    diagonal = float((upper - lower).norm())
-    lower, upper = lower - _MARGIN * diagonal, upper + _MARGIN * diagonal
-    finest = max(float(bounds.radii.min()), _FINEST * diagonal)
-    return Domain(tuple(lower.tolist()), tuple(upper.tolist()), voxel_size=finest)

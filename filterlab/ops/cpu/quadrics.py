@@ -10,8 +10,9 @@ from torch import Tensor
 
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
-from filterlab.ops.cpu.quadric_hits import RAYS_OF_A_CHUNK, QuadricsJob, QuadricsVariant
-from filterlab.ops.quadrics import Quadrics, Rays
+from filterlab.ops.cpu.quadric_hits import QuadricsVariant
+from filterlab.ops.cpu.tree_walk import RAYS_OF_A_CHUNK, WalkJob
+from filterlab.ops.quadrics import InLeaves, Quadrics, Rays
 
 RAYS_AT_ONCE = 1 << 18
 
@@ -20,21 +21,32 @@ def hits(
     given: Quadrics, origins: Tensor, directions: Tensor, sheets: int, farthest: bool = False
 ) -> tuple[Tensor, Tensor]:
     """`ops.reference.quadrics.hits`, fused."""
+    variant = QuadricsVariant(given.planes, given.kept(farthest), farthest, has_fma())
+    return walked(given, variant, origins, directions, sheets, farthest)
+
+
+def has_fma() -> bool:
+    """Whether this machine multiplies and adds with one rounding."""
+    return bool({"fma", "neon"} & compiler.features())
+
+
+def walked(
+    given: InLeaves, variant: compiler.Variant, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
+) -> tuple[Tensor, Tensor]:
+    """`ops.reference.quadrics.walked`, by the program of that variant."""
     parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-    t, piece = zip(*[_of_part(given, o, d, sheets, farthest) for o, d in parts], strict=True)
+    t, piece = zip(*[_of_part(given, variant, o, d, sheets, farthest) for o, d in parts], strict=True)
     return torch.cat(t), torch.cat(piece)
 
 
 def _of_part(
-    given: Quadrics, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
+    given: InLeaves, variant: compiler.Variant, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
 ) -> tuple[Tensor, Tensor]:
     rays = Rays.of(given.tree, origins, directions, farthest)
     tau = rays.first.new_full((len(origins), sheets), torch.inf)
     place = torch.full_like(tau, -1, dtype=torch.int64)
-    job = QuadricsJob(rays=len(origins), sheets=sheets, next=0, chunks=-(-len(origins) // RAYS_OF_A_CHUNK))
+    job = WalkJob(rays=len(origins), sheets=sheets, next=0, chunks=-(-len(origins) // RAYS_OF_A_CHUNK))
     job.point(boxes=given.tree.boxes, children=given.tree.children, leaves=given.leaves, tau=tau, place=place)
     job.point(**{name: getattr(rays, name).contiguous() for name in ("start", "along", "first", "last")})
-    fused = bool({"fma", "neon"} & compiler.features())
-    variant = QuadricsVariant(given.planes, given.kept(farthest), farthest, fused)
     pool.run(compiler.compiled(variant), [job] * max(1, min(torch.get_num_threads(), job.chunks)))
     return rays.t(tau), given.tree.numbers(place)

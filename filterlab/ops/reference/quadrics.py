@@ -17,6 +17,7 @@ top, and those behind a ray's last hit are dropped: memory does not grow with th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -32,6 +33,7 @@ from filterlab.ops.quadrics import (
     SMALLEST,
     SQUARE,
     VECTOR,
+    InLeaves,
     Kept,
     Quadrics,
     Rays,
@@ -39,6 +41,9 @@ from filterlab.ops.quadrics import (
 
 PAIRS_AT_ONCE = 1 << 14  # of rays and nodes, or leaves
 _RAYS_AT_ONCE = 1 << 18
+
+Meets = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Kept, bool], Tensor]
+"""What `intersections` is, of whatever is in leaves."""
 
 
 def hits(
@@ -49,14 +54,21 @@ def hits(
     Returns:
         t, and numbers of the quadrics (R, k) int64, −1 where none is hit.
     """
+    return walked(given, intersections, origins, directions, sheets, farthest)
+
+
+def walked(
+    given: InLeaves, meets: Meets, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
+) -> tuple[Tensor, Tensor]:
+    """The same of whatever is in the leaves of a tree, and meets rays as that function says."""
     parts = zip(origins.split(_RAYS_AT_ONCE), directions.split(_RAYS_AT_ONCE), strict=True)
-    found = [_of_part(given, o, d, sheets, farthest) for o, d in parts]
+    found = [_of_part(given, meets, o, d, sheets, farthest) for o, d in parts]
     t, piece = zip(*found, strict=True)
     return torch.cat(t), torch.cat(piece)
 
 
 def _of_part(
-    given: Quadrics, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
+    given: InLeaves, meets: Meets, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
 ) -> tuple[Tensor, Tensor]:
     rays = Rays.of(given.tree, origins, directions, farthest)
     table = _Table.of_rays(rays, sheets)
@@ -71,7 +83,7 @@ def _of_part(
             stack += _below(given, rays, inner).split()
         leaves = pairs.some(pairs.node < 0)
         if len(leaves.ray):
-            table.take(*_in_leaves(given, rays, leaves.ray, -1 - leaves.node))
+            table.take(*_in_leaves(given, meets, rays, leaves.ray, -1 - leaves.node))
     return rays.t(table.tau), given.tree.numbers(table.place)
 
 
@@ -99,7 +111,7 @@ class _Pairs(NamedTuple):
         return [_Pairs(*rows) for rows in zip(*(x[order].split(PAIRS_AT_ONCE) for x in self), strict=True)]
 
 
-def _below(given: Quadrics, rays: Rays, pairs: _Pairs) -> _Pairs:
+def _below(given: InLeaves, rays: Rays, pairs: _Pairs) -> _Pairs:
     """The children whose boxes are met."""
     start, along = rays.start[pairs.ray], rays.along[pairs.ray]
     along = torch.where(along.abs() < SMALLEST, SMALLEST, along)
@@ -115,11 +127,11 @@ def _below(given: Quadrics, rays: Rays, pairs: _Pairs) -> _Pairs:
     return _Pairs(pairs.ray[pair], torch.where(first < 0, first - child, first + child), near[pair, child])
 
 
-def _in_leaves(given: Quadrics, rays: Rays, ray: Tensor, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _in_leaves(given: InLeaves, meets: Meets, rays: Rays, ray: Tensor, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """All hits of rays in leaves (Q,): numbers of rays, τ, and places (M,)."""
     start, along, first, last = (x[ray] for x in (rays.start, rays.along, rays.first, rays.last))
     kept = given.kept(rays.reversed)
-    tau = intersections(given.leaves[leaf], start, along, first, last, kept, rays.reversed)
+    tau = meets(given.leaves[leaf], start, along, first, last, kept, rays.reversed)
     pair, lane, _ = hit = (tau < torch.inf).nonzero().unbind(1)
     return ray[pair], tau[hit], given.leaves.shape[-1] * leaf[pair] + lane
 
@@ -129,15 +141,20 @@ def intersections(
 ) -> Tensor:
     """τ (Q, 8, 2) where rays (Q, 3) meet the quadrics of leaves (Q, K, 8): front and back; ∞ where they don't."""
     u = along.unsqueeze(-1)
-    p = start.unsqueeze(-1) - leaf[:, CENTER]
-    behind = -(p * u).sum(1)
-    q = p + behind[:, None] * u
+    q, behind = from_center(leaf[:, CENTER], start, u)
     near, far = _clipped(leaf, q, u, first[:, None] - behind, last[:, None] - behind)
     front, back, one = _roots(leaf, q, u, far if reversed else near)
     counts = torch.stack((torch.where(one, kept.touches, kept.falls), ~one & kept.rises), -1)
     roots = torch.stack((front, back), -1)
     within = (roots >= near[..., None]) & (roots <= far[..., None])
     return torch.where(within & counts, roots + behind[..., None], torch.inf)
+
+
+def from_center(center: Tensor, start: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """q (Q, 3, 8), the points of rays (Q, 3), along u (Q, 3, 1), nearest to centres, from there; and τ of them."""
+    p = start.unsqueeze(-1) - center
+    behind = -(p * u).sum(1)
+    return p + behind[:, None] * u, behind
 
 
 def _clipped(leaf: Tensor, q: Tensor, u: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,15 +185,19 @@ def _roots(leaf: Tensor, q: Tensor, u: Tensor, entry: Tensor) -> tuple[Tensor, T
     rounding = ROUNDINGS * torch.finfo(leaf.dtype).eps
     radicand = beta * beta - alpha * gamma
     slack = rounding * (2 * beta.abs() * size_beta + size_a * gamma.abs() + alpha.abs() * size_gamma)
-    s = radicand.sqrt()
-    receding = beta > 0
-    front = torch.where(receding, -(beta + s) / alpha, gamma / (s - beta))
-    back = torch.where(receding, -gamma / (beta + s), (s - beta) / alpha)
+    front, back = stable_roots(alpha, beta, gamma, radicand.sqrt())
     touches = radicand.abs() <= slack
     on = (alpha.abs() <= rounding * size_a) & (beta.abs() <= rounding * size_beta)
     on = on & (gamma.abs() <= rounding * size_gamma)
     front = torch.where(on, entry, torch.where(touches, -beta / alpha, front))
     return front, back, on | touches
+
+
+def stable_roots(alpha: Tensor, beta: Tensor, gamma: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+    """Front and back of α ρ² + 2 β ρ + γ = 0, s = √(β² − αγ): those with α ρ + β = −s and s."""
+    receding = beta > 0
+    front = torch.where(receding, -(beta + s) / alpha, gamma / (s - beta))
+    return front, torch.where(receding, -gamma / (beta + s), (s - beta) / alpha)
 
 
 def _times(a: Tensor, x: Tensor) -> Tensor:
