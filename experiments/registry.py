@@ -26,6 +26,7 @@ _NAMES = (
     "texture_precision",
     "inverse_dvr",
     "inverse_surface",
+    "inverse_terrain",
     "silhouettes",
     "speed_accuracy",
     "equal_error",
@@ -40,6 +41,7 @@ _NAMES = (
     "prefilters_on_tetrahedra",
     "tetrahedral_table",
     "terrain_error",
+    "terrain_quality",
     "demo",
 )
 
