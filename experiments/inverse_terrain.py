@@ -200,16 +200,26 @@ def _images(config: Config, heights: Tensor, cameras: Sequence[Camera]) -> Image
 
 
 def compared(problem: HeightProblem, heights: Tensor) -> Record:
-    """RMS of heights, and of depths and shades of the held-out view; the first two in parts of the relief."""
+    """RMS of the surfaces' heights, of the data, and of depths and shades of the held-out view; in parts of the relief.
+
+    Data may differ where surfaces do not: of the nine data of a cell of `c1` its patches depend on five combinations.
+    """
     config = problem.config
     found = _images(config, heights, [problem.held_out])
     both = found.depth.isfinite() & problem.judged.depth.isfinite()
     rms = lambda x: x.square().mean().sqrt()  # noqa: E731
     return {
-        "height_rms": number(rms(heights - problem.target) / config.relief),
+        "height_rms": number(rms(_fine(config, heights) - _fine(config, problem.target)) / config.relief),
+        "data_rms": number(rms(heights - problem.target) / config.relief),
         "depth_rms": number(rms((found.depth - problem.judged.depth)[both]) / config.relief),
         "shade_rms": number(rms((found.shade - problem.judged.shade)[both])),
     }
+
+
+def _fine(config: Config, heights: Tensor) -> Tensor:
+    """Of the surface, at places four times as near to each other as the data."""
+    axis = torch.linspace(0, 1, 4 * (config.samples - 1) + 1, dtype=torch.float64, device=config.device)
+    return terrain_of(config, heights).jet(torch.cartesian_prod(axis, axis), 0)[0]
 
 
 def compute(config: Config, unit: Unit, run: Run) -> Record:
@@ -226,7 +236,7 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
         progress=run.advance,
     )
     found = state.parameters["heights"].detach()
-    shown = {"target": problem.target, "start": problem.start()["heights"], "result": found}
+    shown = {"target": problem.target, "result": found}
     images = {name: _shown(config, problem, heights, f"{unit.key}-{name}", run) for name, heights in shown.items()}
     array = run.save_array(unit.key, found)
     return {

@@ -42,6 +42,7 @@ _NAMES = (
     "tetrahedral_table",
     "terrain_error",
     "terrain_quality",
+    "terrain_views",
     "demo",
 )
 

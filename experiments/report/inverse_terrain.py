@@ -15,10 +15,12 @@ if TYPE_CHECKING:
     from experiments.inverse_terrain import Config
 
 PANELS = (
-    ("height_rms", "Heights: RMS / relief"),
+    ("height_rms", "Surface: RMS / relief"),
     ("depth_rms", "Depth, held out: RMS / relief"),
     ("shade_rms", "Shade, held out: RMS"),
 )
+
+LEFT = (*PANELS, ("data_rms", "Data: RMS / relief"))
 
 
 def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section:
@@ -27,9 +29,9 @@ def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section
     views, n = config.views, config.samples
     weights = "; ".join(f"{name}: {w.depth:g}, {w.shade:g}" for name, w in config.weights.items())
     lead = (
-        f"Franke's function at {n} × {n} places, a {config.spline} spline. Heights are flat at first and are to have the "
-        f"same depths and shades in {views.count} views of {views.size}² pixels; one more is never matched. Shades are "
-        "those of three suns, one in each colour channel, on matt ground without shadows. "
+        f"Franke's function at {n} × {n} places, a {config.spline} spline. Heights are flat at first and are to have "
+        f"the same depths and shades in {views.count} views of {views.size}² pixels; one more is never matched. Shades "
+        "are those of three suns, one in each colour channel, on matt ground without shadows. "
         f"{config.descent.iterations} steps of Adam, one view each; smoothness {config.smoothness:g}. Weights of depth "
         f"and shade: {weights}. The derivatives are those of hits: no mesh, no stepping.",
     )
@@ -40,11 +42,12 @@ def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section
 
 def _views(records: Sequence[Record], folder: Path) -> Gallery:
     pictures = []
-    for kind, what in (("tinted", "by height"), ("shaded", "three suns")):
-        if records:
-            pictures.append(picture(folder, records[0]["images"]["target"][kind], "target", what))
-        pictures += [picture(folder, r["images"]["result"][kind], f"from {r['compared']}", what) for r in records]
-    return Gallery(pictures, "The held-out view.", columns=1 + len(records))
+    for r in records:
+        for kind, what in (("tinted", "by height"), ("shaded", "three suns")):
+            target, result = (r["images"][name][kind] for name in ("target", "result"))
+            pictures.append(picture(folder, target, "target", what))
+            pictures.append(picture(folder, result, f"from {r['compared']}", what))
+    return Gallery(pictures, "The held-out view, beside that of the target.", columns=4)
 
 
 def _course(records: Sequence[Record]) -> Plot:
@@ -65,16 +68,18 @@ def _course(records: Sequence[Record]) -> Plot:
 
 
 def _left(records: Sequence[Record]) -> Table:
-    columns = [
-        Column("", numeric=False),
-        *(Column(title.partition(":")[0], title.partition(": ")[2]) for _, title in PANELS),
-    ]
+    titles = [title.split(": ") for _, title in LEFT]
+    columns = [Column("", numeric=False)] + [Column(quantity, unit) for quantity, unit in titles]
     rows = []
     if records:
         rows.append(["start", *_numbers(records[0]["observations"][0])])
     rows += [[f"from {r['compared']}", *_numbers(r["observations"][-1])] for r in records]
-    return Table(columns, rows, "RMS differences from the target.")
+    caption = (
+        "RMS differences from the target. Data may differ where surfaces don't: the patches of a cell of c1 depend on "
+        "five combinations of its nine data. What nobody can see, the penalty decides."
+    )
+    return Table(columns, rows, caption)
 
 
 def _numbers(seen: Record) -> list[str]:
-    return [text(seen[quantity]) for quantity, _ in PANELS]
+    return [text(seen[quantity]) for quantity, _ in LEFT]

@@ -22,7 +22,7 @@ READ = {
     "normals": "½ + ½ n as red, green, blue: where normals jump, colours do.",
     "illumination": "Light from the left, no shadows: creases are where normals jump.",
     "reflection lines": (
-        "Mirrored stripes of light. Where a surface is only continuous they tear, where its normals are they have kinks, "
+        "Mirrored stripes of light. Where a surface is only continuous they tear, where its normals are they kink, "
         "where its curvature is they are smooth."
     ),
 }
@@ -46,11 +46,11 @@ def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section
 def _galleries(config: Config, records: Sequence[Record], look: str, folder: Path) -> list[Block]:
     blocks: list[Block] = []
     seen = [r for r in records if r["look"] == look]
-    for group, caption in (("same", "From the same data."), ("equal", "From data for equal errors.")):
-        shown = [r for r in seen if r["group"] == "function"] + [r for r in seen if r["group"] == group]
-        pictures = [picture(folder, r["image"], _name(r), _detail(r)) for r in shown]
-        if pictures:
-            blocks.append(Gallery(pictures, caption, columns=3))
+    for groups, caption in ((("function", "same"), "From the same data."), (("equal",), "From data for equal errors.")):
+        shown = [r for r in seen if r["group"] in groups]
+        if shown:
+            pictures = [picture(folder, r["image"], _name(r), _detail(r)) for r in shown]
+            blocks.append(Gallery(pictures, caption, columns=3 if "same" in groups else 2))
     return blocks
 
 
