@@ -69,7 +69,7 @@ def test_descent_finds_the_surface_by_depths_and_shades(run):
 
 
 def test_the_patches_of_a_cell_of_c1_depend_on_five_combinations_of_its_nine_data():
-    """As the report of `inverse_terrain` says; on 4 × 4 cells of a periodic grid, by the rank of data to coefficients."""
+    """As the report of `inverse_terrain` says; on 4 × 4 cells of a periodic grid, by the rank of the map."""
     from filterlab.surfaces import HeightField
 
     cells = torch.cartesian_prod(torch.arange(4), torch.arange(4))
