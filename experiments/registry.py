@@ -43,6 +43,7 @@ _NAMES = (
     "terrain_error",
     "terrain_quality",
     "terrain_views",
+    "quadrics_tables",
     "demo",
 )
 

@@ -188,7 +188,7 @@ def test_float32_keeps_the_digits_that_heights_do_not_share(kind: str):
         torch.testing.assert_close(own.double(), other, rtol=0, atol=near)
 
 
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.float16, torch.float32])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16])
 def test_heights_are_read_as_they_are_stored(dtype):
     heights, points = (200 * rows(9, 8)).to(dtype), places(50, (9, 8))
     assert torch.equal(field(heights, "c1").jet(points)[0], field(heights.double(), "c1").jet(points)[0])
