@@ -18,6 +18,7 @@ _NAMES = (
     "roots",
     "dvr",
     "surfaces",
+    "terrain",
     "absent",
     "scaling",
     "steadiness",

@@ -44,6 +44,8 @@ _NAMES = (
     "terrain_quality",
     "terrain_views",
     "quadrics_tables",
+    "terrain_roots",
+    "terrain_frames",
     "demo",
 )
 

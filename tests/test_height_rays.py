@@ -82,7 +82,7 @@ def test_the_program_finds_what_plain_torch_finds(kind):
     boundary, diagonal, seed = turn(name, kind)
     case, rng = case_of(name, kind, boundary, diagonal, seed)
     rays = [torch.from_numpy(x) for x in CLASSES[kind][1](rng, case, 200)]
-    given = case.surface._cast
+    given = case.surface.cast
     plain, fused = (ops.first(given, *rays, how) for how in ("reference", "cpu"))
     differ = (plain < torch.inf) != (fused < torch.inf)
     assert int(differ.sum()) <= 2  # rays that touch within rounding

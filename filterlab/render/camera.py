@@ -216,7 +216,7 @@ class PerspectiveCamera(Camera):
 
         Raises ValueError as `framing`.
         """
-        points = torch.as_tensor(as_tensor(points), dtype=torch.float64)
+        points = _vector(points).cpu()
         seen = _Seen.of(points, direction, up, aspect, margin).centered(_half_height(field_of_view))
         return cls._of(seen, up, field_of_view)
 

@@ -230,25 +230,25 @@ class HeightField(Surface):
         return other
 
     def _first(self, origins: Tensor, directions: Tensor) -> Hits:
-        return Hits(ops.first(self._cast, origins.reshape(-1, 3), directions.reshape(-1, 3)))
+        return Hits(ops.first(self.cast, origins.reshape(-1, 3), directions.reshape(-1, 3)))
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
         parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
         return Hits(torch.cat([self._sheets_of_part(o, d, sheets, farthest) for o, d in parts]))
 
     def _sheets_of_part(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
-        found = ops.candidates(self._cast, origins, directions)
+        found = ops.candidates(self.cast, origins, directions)
         extent = self.domain.diagonal / directions.abs().amax(-1).double()
         return sheets_of(found, extent, sheets, farthest)
 
     def met(self, origins: Array, directions: Array) -> Tensor:
         origins, directions = check_rays(origins, directions)
         o, d = (x.detach().reshape(-1, 3) for x in (origins, directions))
-        return ops.met(self._cast, o, d).reshape(origins.shape[:-1])
+        return ops.met(self.cast, o, d).reshape(origins.shape[:-1])
 
     @property
-    def _cast(self) -> height_hits.HeightHits:
-        """The heights as they are now, and bounds of blocks of them."""
+    def cast(self) -> height_hits.HeightHits:
+        """What rays are cast at: the heights as they are now, and bounds of blocks of them."""
         if self.batched:
             raise ValueError(f"rays are cast at one grid; got {len(self.heights)}: make a HeightField of each")
         return self._casts[0]

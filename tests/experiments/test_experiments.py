@@ -237,6 +237,12 @@ def tiny(name, scan):
         "exact": 5,
         "chunk": 25,
     }
+    configs["terrain_roots"] = {
+        "families": ["grazing rays", "rays at the C1 terrain"],
+        "dtypes": ["float32", "float64"],
+        "count": 12,
+    }
+    configs["terrain_frames"] = {"splines": ["c1"], "sizes": [16, 32], "angles": [30], "pixels": 6, "seconds": 0.01}
     configs["hit_error"] = {
         "studies": [{"signal": "torus", "level": 0, "resolutions": [8, 12], "fit_from": 8}],
         "methods": ["trilinear", {"name": "trilinear", "gradient": "central"}, "triquadratic"],
