@@ -26,6 +26,7 @@ _NAMES = (
     "texture_precision",
     "inverse_dvr",
     "inverse_surface",
+    "inverse_terrain",
     "silhouettes",
     "speed_accuracy",
     "equal_error",
@@ -43,6 +44,11 @@ _NAMES = (
     "terrain_roots",
     "terrain_frames",
     "quadrics_tables",
+    "terrain_quality",
+    "terrain_views",
+    "quadrics_tables",
+    "terrain_roots",
+    "terrain_frames",
     "demo",
 )
 

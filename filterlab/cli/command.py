@@ -25,6 +25,7 @@ from filterlab.cli.scene import Scene
 from filterlab.cli.scenes import split_overrides
 from filterlab.cli.sdf import Sdf
 from filterlab.cli.terminal import tell
+from filterlab.cli.terrain import Terrain
 from filterlab.names import unknown_name
 from filterlab.notices import Notice
 
@@ -36,6 +37,7 @@ COMMANDS: dict[str, Any] = {
     "render": Render,
     "mesh": Mesh,
     "scene": Scene,
+    "terrain": Terrain,
     "sdf": Sdf,
     "resample": Resample,
     "convert": Convert,
