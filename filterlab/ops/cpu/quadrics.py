@@ -12,7 +12,7 @@ from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.quadric_hits import QuadricsJob, QuadricsVariant
 from filterlab.ops.cpu.quadric_walk import RAYS_OF_A_CHUNK
-from filterlab.ops.quadrics import Quadrics, Rays
+from filterlab.ops.quadrics import Quadrics, Rays, in_parts
 
 RAYS_AT_ONCE = 1 << 18
 
@@ -21,9 +21,9 @@ def hits(
     given: Quadrics, origins: Tensor, directions: Tensor, sheets: int, farthest: bool = False
 ) -> tuple[Tensor, Tensor]:
     """`ops.reference.quadrics.hits`, fused."""
-    parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-    t, piece = zip(*[_of_part(given, o, d, sheets, farthest) for o, d in parts], strict=True)
-    return torch.cat(t), torch.cat(piece)
+    cast = lambda o, d: _of_part(given, o, d, sheets, farthest)  # noqa: E731
+    t, piece = in_parts(cast, origins, directions, RAYS_AT_ONCE)
+    return t, piece
 
 
 def _of_part(

@@ -13,15 +13,14 @@ from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.quadric_walk import RAYS_OF_A_CHUNK
 from filterlab.ops.cpu.quadrics import RAYS_AT_ONCE, fused
 from filterlab.ops.cpu.slim_hits import MembersJob, MembersVariant, SheetsJob, SheetsVariant
-from filterlab.ops.quadrics import Quadrics, Rays
+from filterlab.ops.quadrics import Quadrics, Rays, in_parts
 from filterlab.ops.slim import Cover, Members, Sheets, members_of
 
 
 def sheets(given: Cover, origins: Tensor, directions: Tensor, count: int, farthest: bool = False) -> Sheets:
     """`ops.reference.slim.sheets`, fused."""
-    parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-    found = [_of_part(given, Rays.of(given.quadrics.tree, o, d, farthest), count) for o, d in parts]
-    return Sheets(*(torch.cat(rows) for rows in zip(*found, strict=True)))
+    cast = lambda o, d: _of_part(given, Rays.of(given.quadrics.tree, o, d, farthest), count)  # noqa: E731
+    return Sheets(*in_parts(cast, origins, directions, RAYS_AT_ONCE))
 
 
 def members(given: Cover, origins: Tensor, directions: Tensor, begin: Tensor, end: Tensor) -> Members:

@@ -15,7 +15,7 @@ from torch import Tensor
 from filterlab.ops.cuda.launch import interpreting, launchable
 from filterlab.ops.cuda.quadric_hits import SCALARS, QuadricsVariant
 from filterlab.ops.cuda.quadric_walk import BLOCK, DEEPEST
-from filterlab.ops.quadrics import Quadrics, Rays
+from filterlab.ops.quadrics import Quadrics, Rays, in_parts
 
 RAYS_AT_ONCE = 1 << 17
 
@@ -24,9 +24,9 @@ def hits(
     given: Quadrics, origins: Tensor, directions: Tensor, sheets: int, farthest: bool = False
 ) -> tuple[Tensor, Tensor]:
     """`ops.reference.quadrics.hits`, fused."""
-    parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-    t, piece = zip(*[_of_part(given, o, d, sheets, farthest) for o, d in parts], strict=True)
-    return torch.cat(t), torch.cat(piece)
+    cast = lambda o, d: _of_part(given, o, d, sheets, farthest)  # noqa: E731
+    t, piece = in_parts(cast, origins, directions, RAYS_AT_ONCE)
+    return t, piece
 
 
 def _of_part(

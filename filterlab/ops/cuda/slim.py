@@ -6,15 +6,14 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.cuda.quadrics import RAYS_AT_ONCE, launch
-from filterlab.ops.quadrics import Rays
+from filterlab.ops.quadrics import Rays, in_parts
 from filterlab.ops.slim import Cover, Members, Sheets, members_of
 
 
 def sheets(given: Cover, origins: Tensor, directions: Tensor, count: int, farthest: bool = False) -> Sheets:
     """`ops.reference.slim.sheets`, fused."""
-    parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-    found = [_of_part(given, Rays.of(given.quadrics.tree, o, d, farthest), count) for o, d in parts]
-    return Sheets(*(torch.cat(rows) for rows in zip(*found, strict=True)))
+    cast = lambda o, d: _of_part(given, Rays.of(given.quadrics.tree, o, d, farthest), count)  # noqa: E731
+    return Sheets(*in_parts(cast, origins, directions, RAYS_AT_ONCE))
 
 
 def _of_part(given: Cover, rays: Rays, count: int) -> Sheets:

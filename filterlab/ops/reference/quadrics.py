@@ -35,6 +35,7 @@ from filterlab.ops.quadrics import (
     Kept,
     Quadrics,
     Rays,
+    in_parts,
 )
 
 PAIRS_AT_ONCE = 1 << 14  # of rays and nodes, or leaves
@@ -49,10 +50,9 @@ def hits(
     Returns:
         t, and numbers of the quadrics (R, k) int64, −1 where none is hit.
     """
-    parts = zip(origins.split(_RAYS_AT_ONCE), directions.split(_RAYS_AT_ONCE), strict=True)
-    found = [_of_part(given, o, d, sheets, farthest) for o, d in parts]
-    t, piece = zip(*found, strict=True)
-    return torch.cat(t), torch.cat(piece)
+    cast = lambda o, d: _of_part(given, o, d, sheets, farthest)  # noqa: E731
+    t, piece = in_parts(cast, origins, directions, _RAYS_AT_ONCE)
+    return t, piece
 
 
 def _of_part(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from filterlab.ops.quadrics import CENTER, MATRIX, SQUARE, VECTOR, Rays
+from filterlab.ops.quadrics import CENTER, MATRIX, SQUARE, VECTOR, Rays, in_parts
 from filterlab.ops.reference.quadrics import walk
 from filterlab.ops.slim import INNER, LEAST_WEIGHT, OUTER, STEEP, Cover, Members, Sheets, behind, members_of
 
@@ -19,9 +19,8 @@ _RAYS_AT_ONCE = 1 << 18
 
 def sheets(given: Cover, origins: Tensor, directions: Tensor, count: int, farthest: bool = False) -> Sheets:
     """The first sheets of rays (R, 3) in order, or the last ones, blended from behind, from the last on."""
-    parts = zip(origins.split(_RAYS_AT_ONCE), directions.split(_RAYS_AT_ONCE), strict=True)
-    found = [_of_part(given, Rays.of(given.quadrics.tree, o, d, farthest), count) for o, d in parts]
-    return Sheets(*(torch.cat(rows) for rows in zip(*found, strict=True)))
+    cast = lambda o, d: _of_part(given, Rays.of(given.quadrics.tree, o, d, farthest), count)  # noqa: E731
+    return Sheets(*in_parts(cast, origins, directions, _RAYS_AT_ONCE))
 
 
 def members(given: Cover, origins: Tensor, directions: Tensor, begin: Tensor, end: Tensor) -> Members:
