@@ -40,15 +40,13 @@ _NAMES = (
     "partitions",
     "prefilters_on_tetrahedra",
     "tetrahedral_table",
+    "quadrics_tables",
+    "inverse_slim",
     "terrain_error",
-    "terrain_roots",
-    "terrain_frames",
-    "quadrics_tables",
     "terrain_quality",
-    "terrain_views",
-    "quadrics_tables",
     "terrain_roots",
     "terrain_frames",
+    "terrain_views",
     "demo",
 )
 
