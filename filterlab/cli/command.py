@@ -25,6 +25,7 @@ from filterlab.cli.resample import Resample
 from filterlab.cli.scene import Scene
 from filterlab.cli.scenes import split_overrides
 from filterlab.cli.sdf import Sdf
+from filterlab.cli.slim import Slim
 from filterlab.cli.terminal import tell
 from filterlab.names import unknown_name
 from filterlab.notices import Notice
@@ -38,6 +39,7 @@ COMMANDS: dict[str, Any] = {
     "mesh": Mesh,
     "scene": Scene,
     "sdf": Sdf,
+    "slim": Slim,
     "resample": Resample,
     "convert": Convert,
     "recommend": Recommend,

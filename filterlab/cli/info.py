@@ -26,16 +26,17 @@ AT_ONCE = 2**17  # numbers
 
 @dataclass(frozen=True)
 class Info:
-    """Show what is in a volume file: its header, where it lies in the world, and how its values are distributed.
+    """Show what is in a file: the header, the place and the values of a volume, or the balls of a SLIM surface.
 
     examples:
       filterlab info engine.nrrd
       filterlab info scan.nii.gz --header-only
       filterlab info series.nii.gz --frame 3
+      filterlab info bunny.npz
     """
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """The volume: a file, or a folder of numbered TIFF slices."""
+    """The volume: a file, or a folder of numbered TIFF slices; or a SLIM surface."""
     header_only: Annotated[bool, arg(aliases=["-H"])] = False
     """Do not read the voxels."""
     frame: Frame = None
@@ -44,25 +45,56 @@ class Info:
     """Which of several values per voxel, from 0."""
 
     def run(self, overrides: dict[str, str]) -> None:
-        from rich.table import Table
-        from rich.text import Text
+        if _holds_slim(self.file):
+            _show(_lines_of_slim(self.file))
+            return
 
         from filterlab.io.volumes import MAX_BYTES, describe
 
         header = describe(self.file, frame=self.frame, channel=self.channel)
-        table = Table(show_header=False, box=None)
-        for name, value in _described(header):
-            table.add_row(name, Text(value))
-        show(table)
+        _show(_described(header))
         if not self.header_only and _tell_open_choice(header):
             with progress_bar() as progress:
                 with reading(progress):
                     samples = header.read(MAX_BYTES)
                 found = _distribution(samples, lambda done: progress(done, "counting"))
-            table = Table(show_header=False, box=None)
-            for name, value in found:
-                table.add_row(name, Text(value))
-            show(table)
+            _show(found)
+
+
+def _show(lines: Sequence[tuple[str, str]]) -> None:
+    """A table of names and what they are."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None)
+    for name, value in lines:
+        table.add_row(name, Text(value))
+    show(table)
+
+
+def _holds_slim(path: Path) -> bool:
+    if path.suffix.lower() != ".npz":
+        return False
+    from filterlab.io.covers import is_slim
+
+    return is_slim(path)
+
+
+def _lines_of_slim(path: Path) -> list[tuple[str, str]]:
+    """Lines about the SLIM surface in a file."""
+    from filterlab.io.covers import load_slim
+
+    slim = load_slim(path)
+    radii, cuts = slim.radii.double(), 0 if slim.cuts is None else slim.cuts.shape[1]
+    lower, upper = slim.domain.lower, slim.domain.upper
+    return [
+        ("file", f"{path} (SLIM surface)"),
+        ("balls", f"{len(slim):,}, {str(slim.A.dtype).removeprefix('torch.')}"),
+        ("radii", f"{float(radii.min()):.6g} … {float(radii.max()):.6g}, median {float(radii.median()):.6g}"),
+        ("planes", f"up to {cuts} for each" if cuts else "none: no ball is cut"),
+        ("x, y, z", "; ".join(f"{a:.6g} … {b:.6g}" for a, b in zip(lower, upper, strict=True))),
+        ("shown", f"{slim.faces} faces, blended over {slim.offset:g} radii"),
+    ]
 
 
 def _described(header: VolumeHeader) -> list[tuple[str, str]]:

@@ -5,6 +5,7 @@ from .config import ConfigError, StrictModel, dump_config, load_config
 from .covers import is_slim, load_slim, save_slim
 from .images import load_image, save_animation, save_image
 from .meshes import MESH_FORMATS, load_mesh, save_mesh
+from .points import load_points
 from .volumes import FORMATS, describe, load_volume, save_volume
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "load_config",
     "load_image",
     "load_mesh",
+    "load_points",
     "load_slim",
     "load_volume",
     "save_animation",

@@ -110,12 +110,17 @@ def _told(cover: Cover, duplicates: int, strays: int, diagonal: float) -> Fit:
     )
 
 
-def _checked(points: Array, normals: Array | None, tolerance: float, least: int) -> tuple[Tensor, Tensor | None]:
-    """Both in float64, on the CPU, without derivatives."""
+def check_settings(tolerance: float, least: int) -> None:
+    """Raises ValueError for a tolerance or a least number of points that `fit_slim` refuses."""
     if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not _RANGE[0] <= tolerance <= _RANGE[1]:
         raise ValueError(f"tolerance must be a part of the diagonal, 1e-12 … 0.1; got {tolerance!r}")
     if isinstance(least, bool) or not isinstance(least, int) or not 6 <= least <= 1000:
         raise ValueError(f"least must be a whole number of points, 6 … 1000; got {least!r}")
+
+
+def _checked(points: Array, normals: Array | None, tolerance: float, least: int) -> tuple[Tensor, Tensor | None]:
+    """Both in float64, on the CPU, without derivatives."""
+    check_settings(tolerance, least)
     own = check_rows("points", as_tensor(points), (None, 3)).detach().double().cpu()
     if normals is None:
         return own, None
