@@ -146,12 +146,12 @@ def surface_scene(volume: str | os.PathLike[str], level: str, overrides: Mapping
 
 
 def slim_scene(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Scene:
-    """The scene of a SLIM surface in a file, seen and lit as that of a `surface_scene`.
+    """The scene of a SLIM surface in a file, seen whole, lit as that of a `surface_scene`.
 
     Raises:
         ConfigError: as `load_scene`.
     """
-    content = {"surface": {"slim": str(path), "subpixels": 2}, **_SURFACE}
+    content = {"surface": {"slim": str(path), "subpixels": 2}, **_SURFACE, "camera": {"direction": _DIRECTION}}
     return loads_config(dump_data(content), Scene, overrides, name=str(path))
 
 
@@ -164,8 +164,9 @@ def values_scene(volume: str | os.PathLike[str], overrides: Mapping[str, str]) -
     return loads_config(dump_data({"volume": str(volume)}), Scene, overrides, name="the command line")
 
 
+_DIRECTION = [-0.6, 0.75, -0.5]
 _SURFACE: Mapping[str, Any] = {
-    "camera": {"direction": [-0.6, 0.75, -0.5], "window": [0.12, 0.12, 0.88, 0.88]},
+    "camera": {"direction": _DIRECTION, "window": [0.12, 0.12, 0.88, 0.88]},
     "lighting": {"lights": [{"direction": [0.5, -0.6, 0.8], "color": [0.9, 0.88, 0.85]}, {"color": [0.3, 0.32, 0.36]}]},
     "background": [0.02, 0.022, 0.03],
 }
