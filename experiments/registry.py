@@ -40,6 +40,8 @@ _NAMES = (
     "prefilters_on_tetrahedra",
     "tetrahedral_table",
     "quadrics_tables",
+    "slim_error",
+    "quadrics_gallery",
     "demo",
 )
 
