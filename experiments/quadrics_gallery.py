@@ -142,7 +142,8 @@ def _torus(config: Config, run: Run) -> Slim:
 
 
 def _camera(config: Config, domain: Domain, direction: tuple[float, float, float] = _DIRECTION) -> PerspectiveCamera:
-    return PerspectiveCamera.framing(domain, direction, aspect=config.size[0] / config.size[1])
+    window = (0.2, 0.2, 0.8, 0.8)  # the box that is framed is that of the balls
+    return PerspectiveCamera.framing(domain, direction, aspect=config.size[0] / config.size[1], window=window)
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------------
