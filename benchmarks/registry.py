@@ -18,6 +18,7 @@ _NAMES = (
     "roots",
     "dvr",
     "surfaces",
+    "slim",
     "absent",
     "scaling",
     "steadiness",

@@ -40,6 +40,7 @@ _NAMES = (
     "prefilters_on_tetrahedra",
     "tetrahedral_table",
     "quadrics_tables",
+    "inverse_slim",
     "slim_error",
     "quadrics_gallery",
     "demo",

@@ -272,6 +272,20 @@ def tiny(name, scan):
         "points": 20,
         "seconds": 0,
     }
+    configs["quadrics_tables"] = {
+        "covers": [80],
+        "sets": [100],
+        "sizes": [[12, 10]],
+        "rays": 30,
+        "quadrics": 8,
+        "seconds": 0,
+    }
+    configs["inverse_slim"] = {
+        "target_balls": 100,
+        "balls": 60,
+        "views": {"training": 2, "held_out": 1, "size": 6, "shown": 8, "at_once": 1},
+        "descent": {"iterations": 2, "learning_rate": 0.01},
+    }
     parts = {n: {"experiment": n, "description": f"tiny {n}", **c} for n, c in configs.items()}
     parts["demo"] = {"experiment": "demo", "description": "tiny", "sections": [parts["rms_error"], parts["dvr_volume"]]}
     if name not in parts:

@@ -5,8 +5,6 @@ Memory beyond the result: 80 bytes for every ray of a part, at most `RAYS_AT_ONC
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -16,7 +14,7 @@ from filterlab.ops.cpu.quadric_walk import RAYS_OF_A_CHUNK
 from filterlab.ops.cpu.quadrics import RAYS_AT_ONCE, fused
 from filterlab.ops.cpu.slim_hits import MembersJob, MembersVariant, SheetsJob, SheetsVariant
 from filterlab.ops.quadrics import Quadrics, Rays
-from filterlab.ops.slim import Cover, Members, Sheets
+from filterlab.ops.slim import Cover, Members, Sheets, members_of
 
 
 def sheets(given: Cover, origins: Tensor, directions: Tensor, count: int, farthest: bool = False) -> Sheets:
@@ -40,21 +38,16 @@ def members(given: Cover, origins: Tensor, directions: Tensor, begin: Tensor, en
     job.next, job.writes = 0, 1
     job.point(count=count.cumsum(0) - count, tau=tau, place=place)
     _run(program, job)
-    own = replace(rays, eye=rays.eye[row], length=rays.length[row])
-    return Members(row, quadrics.tree.numbers(place), own.t(tau[:, None])[:, 0])
+    return members_of(rays, quadrics.tree, row, tau, place)
 
 
 def _of_part(given: Cover, rays: Rays, count: int) -> Sheets:
-    quadrics, number = given.quadrics, len(rays.first)
-    tau = rays.first.new_full((number, count), torch.inf)
-    begin, end, normal = torch.full_like(tau, torch.inf), tau.clone(), tau.new_zeros(number, count, 3)
-    place = torch.full_like(tau, -1, dtype=torch.int64)
+    quadrics, found = given.quadrics, Sheets.none(rays, count)
     job = SheetsJob(**_counted(rays), sheets=count, offset=given.offset)
     _point(job, quadrics, rays)
-    job.point(tau=tau, begin=begin, end=end, normal=normal, place=place)
+    job.point(tau=found.t, begin=found.begin, end=found.end, normal=found.normal, place=found.piece)
     _run(compiler.compiled(SheetsVariant(quadrics.planes, quadrics.kept(rays.reversed), rays.reversed, fused())), job)
-    begin, end = (-end, -begin) if rays.reversed else (begin, end)
-    return Sheets(rays.t(tau), begin, end, normal, quadrics.tree.numbers(place))
+    return found.of_rays(rays, quadrics.tree)
 
 
 def _counted(rays: Rays) -> dict[str, int]:
