@@ -64,7 +64,7 @@ def _plot(study: Study, index: int, covers: list[Record], fits: list[Record]) ->
         f"{_ORDERS[f['order']]} {fixed(f['rms_slope'])} blended, {fixed(f['first_slope'])} first hit" for f in fits
     )
     caption = f"{study.points:,} points of the {study.label}, without noise."
-    return Plot(drawn, f"{caption} Fitted exponents of the number of balls: {slopes}." if slopes else caption)
+    return Plot(drawn, f"{caption} rms ∝ 1 / ballsᵖ with fitted p: {slopes}." if slopes else caption)
 
 
 def _numbers(study: Study, covers: list[Record]) -> Table:
