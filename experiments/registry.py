@@ -42,6 +42,8 @@ _NAMES = (
     "tetrahedral_table",
     "quadrics_tables",
     "inverse_slim",
+    "slim_error",
+    "quadrics_gallery",
     "terrain_error",
     "terrain_quality",
     "terrain_roots",

@@ -24,6 +24,7 @@ from filterlab.cli.resample import Resample
 from filterlab.cli.scene import Scene
 from filterlab.cli.scenes import split_overrides
 from filterlab.cli.sdf import Sdf
+from filterlab.cli.slim import Slim
 from filterlab.cli.terminal import tell
 from filterlab.cli.terrain import Terrain
 from filterlab.names import unknown_name
@@ -39,6 +40,7 @@ COMMANDS: dict[str, Any] = {
     "scene": Scene,
     "terrain": Terrain,
     "sdf": Sdf,
+    "slim": Slim,
     "resample": Resample,
     "convert": Convert,
     "recommend": Recommend,
