@@ -240,10 +240,10 @@ class Quadrics(InTree):
         """
         if self.faces == "both":
             return self
-        return self._casting(self._cast.some(self._facing(eye.detach().to(self.bounds.centers))))
+        return self._casting(self._cast.some(self.facing(eye.detach().to(self.bounds.centers))))
 
-    def _facing(self, eye: Tensor) -> Tensor:
-        """(M,) whether some point of the bounds may face it."""
+    def facing(self, eye: Tensor) -> Tensor:
+        """Which quadrics (M,) may show a world point (3,) the face that counts, front unless faces are "back"."""
         sign = 1 if self.faces == "front" else -1
         A, b, c = (sign * x for x in self._about_centers())
         e = eye - self.bounds.centers
