@@ -40,6 +40,8 @@ _NAMES = (
     "partitions",
     "prefilters_on_tetrahedra",
     "tetrahedral_table",
+    "terrain_error",
+    "quadrics_tables",
     "demo",
 )
 

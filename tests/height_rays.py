@@ -162,8 +162,10 @@ def grazing(rng: Rng, case: Case, rays: int) -> Rays:
     """Tangent to the surface, and 1e-9 … 1e-2 off to either side."""
     ground, x = case.ground, rng.random((rays, 2)) * case.span
     apart = 1e-6
-    slope = [(ground.at(np.clip(x + e, 0, case.span)) - ground.at(np.clip(x - e, 0, case.span))) / (2 * apart)
-             for e in apart * np.eye(2)]
+    slope = [
+        (ground.at(np.clip(x + e, 0, case.span)) - ground.at(np.clip(x - e, 0, case.span))) / (2 * apart)
+        for e in apart * np.eye(2)
+    ]
     flat = rng.normal(size=(rays, 2))
     directions = np.concatenate((flat, (slope[0] * flat[:, 0] + slope[1] * flat[:, 1])[:, None]), 1)
     off = rng.choice([-1.0, 1.0], rays) * 10 ** rng.uniform(-9, -2, rays)

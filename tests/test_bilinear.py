@@ -65,7 +65,7 @@ def test_what_is_aimed_at_is_hit(height, implementation):
     v[:50] = (v[:50] > 0.5).double()
     o, d = aimed(own, u, v)
     surface = quads_of(own)
-    t, piece = ops.hits(surface._cast, o, d, 8, implementation=implementation)
+    t, piece = ops.hits(surface.described, o, d, 8, implementation=implementation)
     off = at_own(t, piece, 9.0)
     assert off.max() < 1e-9
     assert off.median() < 1e-14 * 60
@@ -236,7 +236,7 @@ def test_the_program_does_what_plain_torch_does():
     vertices, faces = ball(8, 0.3)
     o, d = 3 + 2 * numbers(3000, 3, seed=17), numbers(3000, 3, seed=18)
     for faces_, farthest in (("both", False), ("front", True)):
-        cast = BilinearQuads(vertices, faces, faces=faces_)._cast
+        cast = BilinearQuads(vertices, faces, faces=faces_).described
         (t, piece), (own_t, own) = (ops.hits(cast, o, d, 4, farthest, i) for i in ("cpu", "reference"))
         assert torch.equal(piece, own)
         torch.testing.assert_close(t, own_t, rtol=1e-10, atol=1e-10)

@@ -360,7 +360,8 @@ class GridField(Field):
         dtype = type_of_rays(origins, directions)
         lattice = self.lattice
         bounds = ranges(lattice)
-        return Raycast(lattice, self.domain.geometry, level, dtype, bounds.marks(level, dtype), bounds.edge)
+        marks, margin = bounds.marks(level, dtype), bounds.margin(dtype)
+        return Raycast(lattice, self.domain.geometry, level, dtype, marks, bounds.edge, margin)
 
     @property
     def _caster(self) -> str | None:

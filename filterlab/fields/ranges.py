@@ -48,11 +48,15 @@ class Ranges:
     continuous: bool = True
     _marks: dict[tuple[float, torch.dtype], Tensor] = field(default_factory=dict, repr=False, compare=False)
 
+    def margin(self, dtype: torch.dtype) -> float:
+        """What rounding may add to values that are computed in a dtype."""
+        return _ROUNDING * torch.finfo(dtype).eps * self.largest
+
     def may_hold(self, level: float, dtype: torch.dtype) -> Tensor:
         """Which parts may hold the level, (pz, py, px), where values are computed in a dtype."""
         if not self.continuous:
             return torch.ones_like(self.low, dtype=torch.bool)
-        margin = _ROUNDING * torch.finfo(dtype).eps * self.largest
+        margin = self.margin(dtype)
         below, above = (self.codes.of_number(x) for x in (level - margin, level + margin))
         if level + margin < self.ends[0] or level - margin > self.ends[1]:  # only what may hold anything
             below, above = (self.codes.of_number(x) for x in (math.inf, -math.inf))

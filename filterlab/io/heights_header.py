@@ -1,4 +1,4 @@
-"""What a file of heights says of itself, checked, before the heights are read; and the small file beside one.
+"""What a file of heights says of itself, checked, before the heights are read.
 
 A file is untrusted input, as in `filterlab.io.bounded`: what it claims is compared with its length, where that tells
 anything, and with the caller's `max_bytes`, before memory of that size is asked for.
@@ -10,20 +10,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
 
 from filterlab.heights import DEGREE, Heights, metres_per_degree
-from filterlab.io.bounded import VolumeFileError, regular_file, sample_dtype
-from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, dump_config, load_config
+from filterlab.io.bounded import VolumeFileError, sample_dtype
 from filterlab.io.warned import warn
 
 AT_ONCE = 2**21  # samples that are turned from how they are stored into heights
 MAX_TEXT = 10_000  # of a coordinate reference system, as WKT
 
-Count = Annotated[int, Field(ge=1)]
 Pair = tuple[float, float]
 
 
@@ -116,71 +112,8 @@ def check_stored(path: Path, dtype: np.dtype) -> np.dtype:
     return dtype
 
 
-# --- the small file beside one ----------------------------------------------------------------------------------------
-
-
-class HeightsSidecar(StrictModel):
-    """`NAME.npy.yaml` or `NAME.png.yaml`: where the samples of `NAME.npy` lie, and what their numbers mean.
-
-    height = scale · number + offset; the number `missing` is none.
-    """
-
-    size: tuple[Count, Count]
-    spacing: Pair = (1.0, 1.0)
-    origin: Pair = (0.0, 0.0)
-    unit: Annotated[str, Field(max_length=100)] | None = None
-    height_unit: Annotated[str, Field(max_length=100)] | None = None
-    crs: Annotated[str, Field(max_length=MAX_TEXT)] | None = None
-    crs_name: Annotated[str, Field(max_length=200)] | None = None
-    scale: float = 1.0
-    offset: float = 0.0
-    missing: int | None = None
-
-    @classmethod
-    def of(cls, heights: Heights, **numbers: float | None) -> HeightsSidecar:
-        """That of heights."""
-        told = {name: getattr(heights, name) for name in ("unit", "height_unit", "crs", "crs_name")}
-        return cls(size=heights.size, spacing=heights.spacing, origin=heights.origin, **told, **numbers)  # type: ignore[arg-type]
-
-    @property
-    def place(self) -> dict[str, Any]:
-        """What a header takes of it."""
-        names = ("spacing", "origin", "unit", "height_unit", "crs", "crs_name")
-        return {name: getattr(self, name) for name in names}
-
-
-def sidecar_of(path: Path) -> Path:
-    return path.with_name(path.name + ".yaml")
-
-
-def read_sidecar(path: Path, shape: tuple[int, int]) -> HeightsSidecar:
-    """What stands beside a file of (H, W) samples; without a sidecar, samples at whole numbers.
-
-    Raises VolumeFileError for one that is none, or of another size.
-    """
-    sidecar, size = sidecar_of(path), (shape[1], shape[0])
-    if not sidecar.exists():
-        return HeightsSidecar(size=size)
-    try:
-        found = load_config(regular_file(sidecar), HeightsSidecar, max_bytes=MAX_SIDECAR_BYTES)
-    except ConfigError as error:
-        raise VolumeFileError(sidecar, "where the heights lie", str(error)) from None
-    if found.size != size:
-        raise VolumeFileError(sidecar, f"size {list(size)} as in {path.name}", f"size {list(found.size)}")
-    check_place(sidecar, found.spacing, found.origin)
-    return found
-
-
 def check_place(path: Path, spacing: Pair, origin: Pair) -> None:
     """Raises VolumeFileError unless samples stand apart, at finite places."""
     numbers = (*spacing, *origin)
     if not all(math.isfinite(v) and abs(v) < 1e60 for v in numbers) or min(map(abs, spacing)) < 1e-60:
         raise VolumeFileError(path, "a finite origin and a spacing other than 0", f"{origin} and {spacing}")
-
-
-def write_sidecar(path: Path, sidecar: HeightsSidecar) -> None:
-    """Writes it beside the file at `path`, which must not have another one's samples then: write that last."""
-    from filterlab.io.atomic import atomic_write
-
-    with atomic_write(sidecar_of(path)) as temporary:
-        temporary.write_text(dump_config(sidecar), encoding="utf-8")

@@ -27,14 +27,11 @@ from filterlab.io.bounded import (
 from filterlab.io.heights_header import (
     MAX_TEXT,
     HeightsHeader,
-    HeightsSidecar,
     Pair,
     band_of,
     blocks_of_rows,
     check_place,
     check_stored,
-    read_sidecar,
-    write_sidecar,
 )
 from filterlab.io.numpy_files import (
     array_header,
@@ -65,6 +62,8 @@ def is_npz_of_heights(path: Path) -> bool:
 
 def read_npy_header(path: Path) -> HeightsHeader:
     """The checked header of an .npy file and of its sidecar. Raises VolumeFileError."""
+    from filterlab.io.heights_sidecar import read_sidecar
+
     with path.open("rb") as file:
         shape, fortran, dtype = array_header(path, file)
         offset = file.tell()
@@ -186,6 +185,8 @@ def _text(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> str | 
 def write_npy(heights: Heights, path: Path, stored: str | None, final: Path) -> None:
     """The samples; their place goes into a sidecar of the final name, and first, so that no samples stand without."""
     outgoing = _outgoing(path, heights, stored)
+    from filterlab.io.heights_sidecar import HeightsSidecar, write_sidecar
+
     write_sidecar(final, HeightsSidecar.of(heights))
     with path.open("wb") as file:
         write_array(file, outgoing)

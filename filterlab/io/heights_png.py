@@ -11,21 +11,16 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from filterlab.heights import Heights
 from filterlab.io.bounded import EXPANSION, VolumeFileError, check_size
-from filterlab.io.heights_header import (
-    HeightsHeader,
-    HeightsSidecar,
-    band_of,
-    blocks_of_rows,
-    read_sidecar,
-    sidecar_of,
-    write_sidecar,
-)
+from filterlab.io.heights_header import HeightsHeader, band_of, blocks_of_rows
+
+if TYPE_CHECKING:
+    from filterlab.io.heights_sidecar import HeightsSidecar
 
 MOST = 2**16 - 1
 MAX_PIXELS = 178_956_970  # beyond that Pillow opens none
@@ -50,6 +45,8 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def read_header(path: Path) -> HeightsHeader:
     """The checked header of a picture and of its sidecar. Raises VolumeFileError."""
+    from filterlab.io.heights_sidecar import read_sidecar, sidecar_of
+
     with _opened(path) as picture:
         columns, rows = picture.size
         check_size(path, (rows, columns))
@@ -104,6 +101,8 @@ def write(heights: Heights, path: Path, stored: str | None, final: Path) -> None
         raise VolumeFileError(path, f"at most {MAX_PIXELS} heights in a PNG", math.prod(samples.shape))
     scale, offset = _steps(samples[~missing])
     numbers = np.where(missing, 0, np.rint((samples.astype(np.float64) - offset) / scale)).astype(np.uint16)
+    from filterlab.io.heights_sidecar import HeightsSidecar, write_sidecar
+
     write_sidecar(final, HeightsSidecar.of(heights, scale=scale, offset=offset, missing=0))
     Image.fromarray(numbers).save(path, format="PNG")
 

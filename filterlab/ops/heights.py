@@ -13,12 +13,44 @@ and their 15 coefficients stand in the order of `filterlab.bernstein`. `ops.refe
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import comb, perm
 
+import torch
 from torch import Tensor
 
+from filterlab.bernstein import multi_indices
+from filterlab.ops.gather import STORAGE
 from filterlab.volume import Boundary
 
 DIAGONALS = ("main", "anti")
+DEGREE = 4
+
+
+def rows(order: int) -> tuple[tuple[int, int], ...]:
+    """The derivatives (i, j) along x and y of a jet: z; z_x, z_y; z_xx, z_xy, z_yy; …"""
+    return tuple((own - j, j) for own in range(order + 1) for j in range(own + 1))
+
+
+def raised(order: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Which rows of the next higher order are the derivatives of these along x, and along y."""
+    every = rows(order + 1)
+    return tuple(every.index((i + 1, j)) for i, j in rows(order)), tuple(
+        every.index((i, j + 1)) for i, j in rows(order)
+    )
+
+
+def differences(i: int, j: int) -> dict[int, int]:
+    """∂^i along λ1 and ∂^j along λ2 of degree 4, of what is left after 4 − r steps, r = i + j ≤ 4:
+
+    4!/(4 − r)! (e_1 − e_0)^i (e_2 − e_0)^j, in which e_α stands for the coefficient c_α. Place -> weight.
+    """
+    order = i + j
+    place = {alpha: n for n, alpha in enumerate(multi_indices(order, 2))}
+    return {
+        place[order - p - q, p, q]: perm(DEGREE, order) * comb(i, p) * comb(j, q) * (-1) ** (order - p - q)
+        for p in range(i + 1)
+        for q in range(j + 1)
+    }
 
 
 @dataclass(frozen=True)
@@ -61,6 +93,16 @@ class Pattern:
         """Whether s is taken from the other end."""
         return self.diagonal == "main"
 
+    @property
+    def offsets(self) -> tuple[tuple[int, int], ...]:
+        """(a, b) of the data of `up`: a steps from V0 towards V1, b towards V2; the same of both triangles."""
+        return tuple((self.steps - a if self.mirrored else a, b) for a, b in self.up.samples)
+
+    @property
+    def reach(self) -> int:
+        """How many steps beyond a cell its data are."""
+        return max(max(-a, -b, a - self.steps, b - self.steps) for a, b in self.offsets)
+
 
 @dataclass(frozen=True, eq=False)
 class Heights:
@@ -84,3 +126,12 @@ class Heights:
         """How many columns and rows of cells hold the data; of a single row or column one."""
         rows, columns = (max(1, -(-(n - 1) // self.pattern.steps)) for n in self.values.shape[-2:])
         return columns, rows
+
+
+def unsupported(heights: Heights, points: Tensor) -> str | None:
+    """What no fused implementation can do; None: nothing."""
+    if points.dtype not in (torch.float32, torch.float64):
+        return f"points must be float32 or float64; got {points.dtype}"
+    if heights.values.dtype not in STORAGE:
+        return f"heights must be stored as {', '.join(STORAGE.values())}; got {heights.values.dtype}"
+    return None

@@ -126,6 +126,7 @@ class Raycast:
             x + 2 y + 4 z tells whether its part there does, of two along every axis. Else −1 − r, where no brick within
             r of it, along every axis, may hold it.
         edge: cells along an edge of a brick, a power of two from 2 on.
+        margin: what rounding may add to values.
     """
 
     lattice: AnyLattice
@@ -134,6 +135,7 @@ class Raycast:
     dtype: torch.dtype
     marks: Tensor
     edge: int
+    margin: float
 
 
 def marks_of(parts: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, as_numbers, as_tensor
 from filterlab.fields.base import Field
 from filterlab.ops.reference.optics import dot, safe_normalize
 from filterlab.render.scenery import Sky
@@ -363,7 +363,7 @@ def check_opacity(opacity: float) -> None:
 
 
 def _check_direction(name: str, vector: Sequence[float]) -> None:
-    given = torch.as_tensor(as_tensor(vector), dtype=torch.float64)
+    given = as_numbers(vector)
     if given.shape != (3,) or not given.isfinite().all() or not given.any():
         raise ValueError(f"{name} must be three finite numbers, not all zero; got {vector!r}")
 

@@ -36,7 +36,6 @@ from filterlab.render.silhouettes import COUNTED, Eye, Silhouettes, swept
 from filterlab.surfaces.base import Hits, Surface, SurfacePoints, check_sheets
 
 _PART = 1 << 15  # rays at a time; what they meet is cut up further by the surface
-_LIFT = 1e-3  # voxels by which a ray to a light begins in front of the surface
 _MOST_SUBPIXELS = 64
 
 CHANNELS = {"color": 4, "depth": 1, "normal": 3, "position": 3, "sheets": 1}
@@ -96,7 +95,7 @@ class Casting:
     def _color(self, at: SurfacePoints, hits: Hits, origins: Tensor, directions: Tensor) -> Tensor:
         """Sheets in front of each other, from the eye on, over the background: RGB and opacity (R, 4)."""
         valid = hits.valid
-        seen = self._seen(at, valid, directions)
+        seen = self._seen(at, hits, directions)
         colors = at.point.new_zeros(at.point.shape).index_put((valid,), self.material(seen, self.lights))
         layers = Layers(
             colors, self.material.opacity * valid.to(colors), self._distances(at, valid, origins, directions)
@@ -140,13 +139,14 @@ class Casting:
         put = lambda rows, new: rows.index_put((wet,), new[:, None].to(rows))  # noqa: E731
         return Layers(put(layers.color, color), put(layers.opacity, torch.ones_like(face)), put(layers.distance, face))
 
-    def _seen(self, at: SurfacePoints, valid: Tensor, directions: Tensor) -> Seen:
+    def _seen(self, at: SurfacePoints, hits: Hits, directions: Tensor) -> Seen:
         assert at.normal is not None
+        valid = hits.valid
         direction = directions.to(self.dtype)[:, None].expand_as(at.point)[valid]
         point, normal = at.point[valid], at.normal[valid]
         curved = (None, None) if at.curvatures is None else (at.curvatures[valid], at.principal[valid])  # type: ignore[index]
         toward_eye = torch.where(dot(normal, direction)[:, None] > 0, -normal, normal).detach()
-        lifted = point.detach() + _LIFT * self.surface.domain.voxel_size * toward_eye
+        lifted = point.detach() + self.surface.clearance(hits)[valid][:, None].to(point) * toward_eye
 
         def visibility(light: Light) -> Tensor | None:
             if not self.shadows or light.direction is None:  # a headlight shines wherever the eye sees

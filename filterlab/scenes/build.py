@@ -150,12 +150,15 @@ def _number(text: str) -> float | str:
 AnyPrepared = Prepared | PreparedSurface | PreparedProjection | PreparedSlice
 
 
-def build(scene: Scene) -> AnyPrepared:
+def build(scene: Scene, volume: Volume | None = None) -> AnyPrepared:
     """Loads or samples what the scene shows, reconstructs it and builds camera, lights and what they fall on.
+
+    Args:
+        volume: that of the scene's file, where it has been read.
 
     Raises ValueError where `method: auto` finds nothing within its budget, with the best there is.
     """
-    volume = _volume(scene)
+    volume = _volume(scene, volume)
     scene, chosen = settled(scene, volume)
     if volume is None:
         assert scene.signal is not None
@@ -237,11 +240,11 @@ def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]
     return scene.model_copy(update={"method": explicit, "step": step}), tuple(report.sentences(found))
 
 
-def _volume(scene: Scene) -> Volume | None:
+def _volume(scene: Scene, loaded: Volume | None) -> Volume | None:
     """The samples, in the type and on the device of the scene; None for a signal that is shown as it is."""
     dtype = scene.dtype
     if scene.volume is not None:
-        volume = scene.volume.load()
+        volume = loaded or scene.volume.load()
     else:
         assert scene.signal is not None
         if scene.signal.samples is None:

@@ -33,13 +33,15 @@ from filterlab.names import NAN_CHOICES
 from filterlab.ops import height_hits
 from filterlab.ops import heights as described
 from filterlab.ops.differentiable import height_hits as ops
+from filterlab.ops.differentiable import heights as jets
 from filterlab.ops.reference import heights as reference
-from filterlab.surfaces.base import Hits, Surface, check_rays
+from filterlab.surfaces.base import Hits, Surface, all_finite, check_rays
 from filterlab.surfaces.level_set import RAYS_AT_ONCE
-from filterlab.surfaces.sheets import sheets_of
 from filterlab.surfaces.quartic import quartic_spline
 from filterlab.surfaces.relief import Relief
+from filterlab.surfaces.sheets import sheets_of
 from filterlab.volume import Boundary
+
 
 class HeightField(Surface):
     """The ground z = s(x, y) of a quartic spline s of heights on a grid.
@@ -131,7 +133,7 @@ class HeightField(Surface):
 
     def _explicit(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         n = self.heights.shape[0] if self.batched else 1
-        rows = reference.jet(self._described, points.reshape(n, -1, 2), order)
+        rows = jets.jet(self._described, points.reshape(n, -1, 2), order)
         z, *slopes = (row.reshape(points.shape[:-1]) for row in rows.unbind(1))
         if order == 0:
             return (z,)
@@ -281,11 +283,9 @@ def _resolved(heights: Tensor, choice: str) -> Tensor:
     """Heights that are finite, or NaN where they are holes."""
     if choice not in NAN_CHOICES:
         raise ValueError(f"nan must be one of {', '.join(NAN_CHOICES)}; got {choice!r}")
-    if not heights.dtype.is_floating_point:
+    if not heights.dtype.is_floating_point or all_finite(heights.detach()):
         return heights
     unknown = ~heights.detach().isfinite()
-    if not bool(unknown.any()):
-        return heights
     if choice == "refuse":
         raise ValueError(
             f"expected finite heights; got {int(unknown.sum()):,} of {heights.numel():,} that are not: "

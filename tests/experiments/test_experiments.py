@@ -55,6 +55,7 @@ def tiny(name, scan):
             "markers": 9,
             "dimensions": [1],
         },
+        "terrain_error": {"splines": ["linear", "c1", "c2 prefiltered"], "steps": [12, 24], "points": 50},
         "partitions": {"splines": ["quadratic-c1", "qss"], "fineness": 2},
         "rms_error": {
             "studies": [{"signal": "gaussian", "resolutions": [4, 6], "fit_from": 4}],

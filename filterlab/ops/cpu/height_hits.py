@@ -84,7 +84,9 @@ def _cast(given: HeightHits, asked: str, lines: Lines, capacity: int = 0, **resu
     job.cells_x, job.cells_y = given.heights.cells
     job.chunks = -(-len(lines.near) // (LANES * PACKS_OF_A_CHUNK))
     starts, widths = (torch.tensor(x) for x in (pyramid.starts, [w for _, w in pyramid.sizes]))
-    rays = {name: x.contiguous() for name, x in zip(("origins", "directions", "far"), (*lines[:2], lines.far), strict=True)}
+    rays = {
+        name: x.contiguous() for name, x in zip(("origins", "directions", "far"), (*lines[:2], lines.far), strict=True)
+    }
     job.point(bounds=pyramid.numbers, starts=starts, widths=widths, **rays, **results)
     _point_to(job, given.heights, given.cell)
     _run(HeightRaysVariant(asked, given.cell, STORAGE[given.heights.values.dtype]), job)

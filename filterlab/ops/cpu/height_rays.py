@@ -172,7 +172,7 @@ class _Program:
         return self.builder.select(self.builder.icmp_signed(">", a, c), a, c)
 
     def _step(self, line: _Line, lane: Value) -> None:
-        e, b, j = self.lanes, self.builder, self.job
+        e, b = self.lanes, self.builder
         level, s = self.level.value, self.s.value
         cell = [own.value for own in self.cell_at]
         ways = [self._way(line, axis, cell[axis], level) for axis in range(2)]
@@ -203,9 +203,7 @@ class _Program:
         start, width = (b.load(e.advance(array, own, I64), typ=I64) for array in (j.starts, j.widths))
         x, y = (b.ashr(n, level) for n in cell)
         block = e.advance(j.bounds, b.shl(b.add(start, b.add(b.mul(y, width), x)), I64(1)), FLOAT)
-        low, high = (
-            b.fpext(b.load(e.advance(block, I64(k), FLOAT), typ=FLOAT), DOUBLE) for k in range(2)
-        )
+        low, high = (b.fpext(b.load(e.advance(block, I64(k), FLOAT), typ=FLOAT), DOUBLE) for k in range(2))
         first, last = (line.at(e, 2, at) for at in (s, out))
         below = b.fcmp_ordered("<=", e.minimum(first, last), high)
         return b.and_(below, b.fcmp_ordered(">=", e.maximum(first, last), low))
@@ -454,4 +452,3 @@ class _Candidates(_Program):
                 for n, number in enumerate(numbers):
                     b.store(number, e.advance(array, b.add(b.mul(index, I64(len(numbers))), I64(n)), kind))
         self.count.value = b.add(count, I64(1))
-
