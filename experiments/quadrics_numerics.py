@@ -1,5 +1,5 @@
-"""What rounding does to rays at quadrics: roots by three formulas, where rays are measured from, which quadrics are left
-out, how flat bilinear quads may be. In float32 and float64, by the library's own functions.
+"""What rounding does to rays at quadrics: roots by three formulas, where rays are measured from, which quadrics are
+left out, how flat bilinear quads may be; how hits are blended. In float32 and float64, by the library's own functions.
 
 Letters: α λ² + 2 β λ + γ = 0 with s = √(β² − αγ) along a ray e + λ v; front is the root where F falls. The formulas:
 
@@ -15,7 +15,7 @@ of equations these are. What is exact is computed in 64 bits (numpy.longdouble),
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -23,14 +23,16 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from experiments import covers
 from experiments.config import Dtype, ExperimentConfig
 from experiments.runs import Record, Run, Unit
 from filterlab.ops import bilinear as patches
 from filterlab.ops.quadrics import InLeaves, Kept, Quadrics
 from filterlab.ops.reference import bilinear, quadrics
 from filterlab.ops.reference.quadrics import Meets
+from filterlab.ops.reference.slim import weight
 from filterlab.ops.tree import Boxes
-from filterlab.surfaces import Bounds, Spheres, Tetrahedra
+from filterlab.surfaces import Bounds, Slim, Spheres, Surface, Tetrahedra
 from filterlab.surfaces import Quadrics as QuadricSurface
 
 LINEAR = 1e-6  # |α| below which formula 7 is left, where it has a case of its own
@@ -46,6 +48,7 @@ class Config(ExperimentConfig):
         dtypes: of the roots. alphas: α of them; β and γ are of size one.
         distances: of the eye from the middle of a ball, in radii.
         heights: of bilinear quads, in sizes.
+        covers: numbers of balls that a torus is covered by. offsets: of a ball's radius, within which hits are blended.
         count: rays, or quadratics, of each. quadrics: that may be culled, of each kind of bounds. points: of each.
     """
 
@@ -54,6 +57,8 @@ class Config(ExperimentConfig):
     alphas: Annotated[list[Annotated[float, Field(gt=0, le=1)]], Field(min_length=1)]
     distances: Annotated[list[Annotated[float, Field(gt=1)]], Field(min_length=1)]
     heights: Annotated[list[Annotated[float, Field(gt=0, le=1)]], Field(min_length=1)]
+    covers: Annotated[list[Annotated[int, Field(ge=50, le=10**6)]], Field(min_length=1)]
+    offsets: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)]
     count: Annotated[int, Field(ge=10, le=10**7)]
     quadrics: Annotated[int, Field(ge=10, le=10**7)]
     points: Annotated[int, Field(ge=1, le=1000)]
@@ -65,6 +70,7 @@ def units(config: Config) -> list[Unit]:
     rows += [(f"distance/{d:g}", 2e-5 * config.count) for d in config.distances]
     rows += [(f"culling/{kind}", 1e-6 * config.quadrics * config.points) for kind in ("spheres", "tetrahedra")]
     rows += [(f"quads/{h:g}", 2e-5 * config.count) for h in config.heights]
+    rows += [(f"blending/{n}", 1e-5 * config.count * len(config.offsets)) for n in config.covers]
     return [Unit(key, key.replace("/", ", "), seconds) for key, seconds in rows]
 
 
@@ -76,6 +82,8 @@ def compute(config: Config, unit: Unit, _run: Run) -> Record:
         return _roots(rng, rest[0], float(rest[1]), config.count)
     if table == "distance":
         return _distance(rng, float(rest[0]), config.count)
+    if table == "blending":
+        return _blending(rng, int(rest[0]), config.offsets, config.count)
     if table == "quads":
         return _quads(rng, float(rest[0]), config.count)
     return _culling(rng, rest[0], config.quadrics, config.points)
@@ -354,3 +362,35 @@ def _off_quadric(A: np.ndarray, b: np.ndarray, q: np.ndarray) -> float:
     """The distance that 99 % of points of patches have from their quadrics, in float64."""
     turned = _times(A, q)
     return float(np.quantile(np.abs(_dot(q, turned + 2 * b)) / (2 * np.linalg.norm(turned + b, axis=1)), 0.99))
+
+
+# --- blending ---------------------------------------------------------------------------------------------------------
+
+
+def _blending(rng: np.random.Generator, balls: int, offsets: Sequence[float], count: int) -> Record:
+    """How far, rms, hits of a torus are from it, covered by graphs of second order; what the weight does at ½."""
+    cover = covers.torus(balls)
+    aim = torch.from_numpy(rng.normal(size=(count, 3))) * torch.tensor([0.7, 0.7, 0.2])
+    o = 5 * torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(count, 3))), dim=-1)
+    rays = o, torch.nn.functional.normalize(aim - o, dim=-1)
+    nearest = QuadricSurface(
+        cover.A, cover.b, cover.c, Spheres(cover.centers, cover.radii), origins=cover.centers, faces="front"
+    )
+    surfaces = {"nearest": nearest} | {f"{x:g}": Slim(*cover, offset=x) for x in offsets}
+    record: Record = {"balls": len(cover.centers), "radius": float(cover.radii[0]), "jumps": _jumps()}
+    return record | {"rms": {name: _rms(surface, *rays) for name, surface in surfaces.items()}}
+
+
+def _rms(surface: Surface, origins: Tensor, directions: Tensor) -> float:
+    hit = surface.hit(origins, directions)
+    point = surface.at(origins, directions, hit, order=0).point[hit.valid]
+    return float(covers.distance(point).square().mean().sqrt())
+
+
+def _jumps() -> list[float]:
+    """By how much w / w(½) and w′ / w′(½) jump at ½, and what they are at 1."""
+    rho = torch.tensor([0.5, math.nextafter(0.5, 1), 1.0], dtype=torch.float64, requires_grad=True)
+    w = weight(rho * rho)
+    (slope,) = torch.autograd.grad(w.sum(), rho)
+    w = w.detach()
+    return [float(abs(x[1] / x[0] - 1)) for x in (w, slope)] + [float(w[2]), float(slope[2])]

@@ -103,6 +103,19 @@ def _quads(records: Sequence[Record]) -> list[Block]:
     return [Table(columns, rows, caption)]
 
 
+def _blending(records: Sequence[Record]) -> list[Block]:
+    offsets = [name for name in records[0]["rms"] if name != "nearest"]
+    columns = [Column("balls"), Column("radius"), Column("nearest"), *(Column(x, "blended, offset") for x in offsets)]
+    rows = [[f"{r['balls']:,}", f"{r['radius']:.3f}", *map(_short, r["rms"].values())] for r in records]
+    value, slope, *ends = records[0]["jumps"]
+    caption = (
+        "A torus, R = 1, r = 0.4, covered by graphs of second order, every point in six balls: rms distance of hits "
+        f"from it; offsets in radii. The weight jumps by {value:.0e}, its slope by {slope:.0e} at ½, of what they are "
+        f"there; at 1 they are {ends[0]:.0e} and {ends[1]:.0e}."
+    )
+    return [Table(columns, rows, caption)]
+
+
 def _pairs(names: Sequence[str]) -> list[Column]:
     return [Column(what, name) for name in names for what in ("error", "missed")]
 
@@ -118,4 +131,10 @@ def _short(number: float | None) -> str:
     return "–" if number is None else f"{number:.1e}"
 
 
-TABLES = {"roots": _roots, "distance": _distances, "culling": _culling, "quads": _quads}
+TABLES = {
+    "roots": _roots,
+    "distance": _distances,
+    "culling": _culling,
+    "quads": _quads,
+    "blending": _blending,
+}

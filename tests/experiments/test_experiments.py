@@ -196,6 +196,8 @@ def tiny(name, scan):
         "alphas": [1, 1e-6],
         "distances": [30],
         "heights": [1, 1e-4],
+        "covers": [100],
+        "offsets": [0, 0.5],
         "count": 500,
         "quadrics": 60,
         "points": 2,
