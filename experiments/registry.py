@@ -34,6 +34,7 @@ _NAMES = (
     "fit_kernel",
     "recommend_validation",
     "stability",
+    "quadrics_numerics",
     "root_finding",
     "hit_error",
     "isosurface_quality",

@@ -228,6 +228,17 @@ def tiny(name, scan):
         "rows": 2,
         "repeats": 2,
     }
+    configs["quadrics_numerics"] = {
+        "dtypes": ["float32"],
+        "alphas": [1, 1e-6],
+        "distances": [30],
+        "heights": [1, 1e-4],
+        "covers": [100],
+        "offsets": [0, 0.5],
+        "count": 500,
+        "quadrics": 60,
+        "points": 2,
+    }
     configs["root_finding"] = {
         "families": ["random", "double", "root-at-end"],
         "degrees": [4, 5],
