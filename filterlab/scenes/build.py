@@ -275,8 +275,8 @@ def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]
         return scene, ()
     found = recommend(volume, method.max_error, task="dvr", boundary=method.boundary, nan=method.nan)
     if found.pick is None:
-        best = report.sentences(found)[-1].removeprefix("The ").removesuffix(".")
-        raise ValueError(f"method: found none within max_error {report.percent(method.max_error)}; the {best}")
+        told = " ".join(report.sentences(found)[2:]).removeprefix("The ").removesuffix(".")
+        raise ValueError(f"method: found none within max_error {report.percent(method.max_error)}; the {told}")
     explicit = SceneMethod(
         name=found.pick.method,
         scheme=found.pick.scheme,
