@@ -10,6 +10,7 @@ hold anything.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -19,7 +20,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from filterlab.ops.bounds import Codes
 from filterlab.ops.differentiable.bounds import bounds
 from filterlab.ops.pieces import Lattice
-from filterlab.ops.raycast import bits_of_blocks, marks_of, marks_of_bits
+from filterlab.ops.raycast import bits_of_blocks, marks_of_bits
 from filterlab.ops.reference.bounds import layers_of, weights_of
 from filterlab.ops.tetrahedra import AnyLattice, TetrahedralLattice
 
@@ -99,7 +100,6 @@ class Ranges:
         ends: the least and the greatest of all.
         largest: Σ |w| · max |c|, what rounding of a sum is relative to.
         edge: cells along an edge of a brick.
-        continuous: whether the field is: else a jump over a level may lie between bricks that don't hold it.
     """
 
     parts: Blocks
@@ -107,7 +107,6 @@ class Ranges:
     ends: tuple[float, float]
     largest: float
     edge: int
-    continuous: bool = True
     _marks: dict[tuple[float, torch.dtype], Tensor] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -126,8 +125,6 @@ class Ranges:
 
     def may_hold(self, level: float, dtype: torch.dtype) -> Tensor:
         """Which parts may hold the level, (pz, py, px), where values are computed in a dtype."""
-        if not self.continuous:
-            return torch.ones(self.parts.shape, dtype=torch.bool, device=self.parts.low.device)
         return self.parts.straddling(*self._codes_of(level, dtype))
 
     def _codes_of(self, level: float, dtype: torch.dtype) -> tuple[int, int]:
@@ -142,15 +139,10 @@ class Ranges:
         """`ops.raycast.marks_of` the same; those last asked for are kept."""
         found = self._marks.get((level, dtype))
         if found is None:
-            found = self._marks_of(level, dtype)
+            found = marks_of_bits(self.parts.bits(*self._codes_of(level, dtype)))
             self._marks.clear()
             self._marks[level, dtype] = found
         return found
-
-    def _marks_of(self, level: float, dtype: torch.dtype) -> Tensor:
-        if not self.continuous:
-            return marks_of(self.may_hold(level, dtype))
-        return marks_of_bits(self.parts.bits(*self._codes_of(level, dtype)))
 
 
 _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
@@ -189,8 +181,21 @@ def _made(lattice: AnyLattice, edge: int) -> Ranges:
     least, most = _ends(lattice.coefficients.detach())
     codes = Codes.of(lattice, least, most)
     low, high, ends = bounds(lattice, edge // 2, codes)
+    if not lattice.continuous:  # a jump over a level lies between parts of which neither may hold it
+        low, high = _with_neighbours(low, torch.minimum), _with_neighbours(high, torch.maximum)
     largest = abs(lattice.scale) * max(abs(least), abs(most)) * _norm(lattice) + abs(lattice.shift)
-    return Ranges(Blocks.of(low, high), codes, ends, largest, edge, lattice.continuous)
+    return Ranges(Blocks.of(low, high), codes, ends, largest, edge)
+
+
+def _with_neighbours(codes: Tensor, choose: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Of every part and those around it."""
+    for dim in range(3):
+        own, count = codes.clone(), codes.shape[dim] - 1
+        for to, of in ((0, 1), (1, 0)):
+            place = own.narrow(dim, to, count)
+            place.copy_(choose(place, codes.narrow(dim, of, count)))
+        codes = own
+    return codes
 
 
 def _ends(c: Tensor) -> tuple[float, float]:
