@@ -6,7 +6,7 @@ The oracle cuts rays where they pass planes of knots, and evaluates the sum over
 from __future__ import annotations
 
 from fractions import Fraction
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def crossings(name: str, volume: np.ndarray, level: float, o: np.ndarray, d: np.
     knots = np.unique(np.concatenate([[begin, end], *planes]))
     knots = knots[(knots >= begin) & (knots <= end)]
     found, before = [], None
-    for a, z in zip(knots[:-1], knots[1:], strict=True):
+    for a, z in pairwise(knots):
         cell = np.floor(o + (a + z) / 2 * d - shift).astype(int)
         t = np.linspace(a, z, 4)  # of degree 3
         f = np.array([value(name, volume, cell, o + own * d) for own in t]) - level
