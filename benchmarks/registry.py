@@ -19,6 +19,7 @@ _NAMES = (
     "dvr",
     "surfaces",
     "terrain",
+    "slim",
     "absent",
     "scaling",
     "steadiness",

@@ -1,4 +1,4 @@
-"""Many rays of every class at quadrics and at bilinear quads of every class, judged by extended precision, then exactly.
+"""Many rays of every class at quadrics and at bilinear quads of every class, judged by 64 bits, and exactly where not.
 
 python -m tests.quadric_many 600 [seed]     for so many seconds; prints what was missed or invented, and of how many
 

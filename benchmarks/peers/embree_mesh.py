@@ -8,7 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 from skimage.measure import marching_cubes
+from torch import Tensor
 
 from benchmarks.harness import Contestant
 from benchmarks.peers.task import Casting, without
@@ -29,12 +31,17 @@ def casting(task: Casting) -> Contestant:
 
 def built(task: Casting, level: float) -> Any:
     """Marching cubes, and the tree of what they give."""
+    vertices, faces, *_ = marching_cubes(task.volume.numpy(), level)
+    return scene_of(vertices[:, ::-1], faces)
+
+
+def scene_of(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """Triangles (T, 3) of vertices (V, 3), and the tree over them."""
     from embreex import rtcore_scene
     from embreex.mesh_construction import TriangleMesh
 
-    vertices, faces, *_ = marching_cubes(task.volume.numpy(), level)
     scene = rtcore_scene.EmbreeScene()
-    TriangleMesh(scene, np.ascontiguousarray(vertices[:, ::-1], dtype=np.float32), faces.astype(np.int32))
+    TriangleMesh(scene, np.ascontiguousarray(vertices, dtype=np.float32), faces.astype(np.int32))
     return scene
 
 
@@ -52,6 +59,12 @@ def of_heights(heights: np.ndarray, spacing: float) -> Any:
     scene = rtcore_scene.EmbreeScene()
     TriangleMesh(scene, vertices, faces.astype(np.int32))
     return scene
+
+
+def depths(scene: Any, rays: tuple[Tensor, Tensor]) -> Tensor:
+    """t (R,) of float32 rays (R, 3), float64; ∞ where nothing is hit."""
+    found = scene.run(*(x.numpy() for x in rays), output=True)
+    return torch.where(torch.from_numpy(found["primID"]) < 0, torch.inf, torch.from_numpy(found["tfar"]).double())
 
 
 def new_level(task: Casting, level: Any) -> Contestant:

@@ -34,6 +34,7 @@ from filterlab.ops import height_hits
 from filterlab.ops import heights as described
 from filterlab.ops.differentiable import height_hits as ops
 from filterlab.ops.differentiable import heights as jets
+from filterlab.ops.gather import STORAGE
 from filterlab.ops.reference import heights as reference
 from filterlab.surfaces import sight
 from filterlab.surfaces.base import Hits, Surface, all_finite, check_rays
@@ -43,13 +44,16 @@ from filterlab.surfaces.relief import Relief
 from filterlab.surfaces.sheets import sheets_of
 from filterlab.volume import Boundary
 
+_TYPES = {*STORAGE, torch.int64}
+_WIDER = {torch.uint16: torch.int32, torch.uint32: torch.int64}  # torch reads none of these
+
 
 class HeightField(Surface):
     """The ground z = s(x, y) of a quartic spline s of heights on a grid.
 
     Args:
-        heights: (H, W), or (N, H, W) for jets of many; any H, W ≥ 1, real, of any type: it is neither copied nor
-            converted, but for what `nan` says. World units. Differentiable.
+        heights: (H, W), or (N, H, W) for jets of many; any H, W ≥ 1, real: it is neither copied nor converted, but
+            for what `nan` says, and for uint16 and uint32, which become int32 and int64. World units. Differentiable.
         spline: "linear", "c0", "c1" or "c2"; `surfaces.quartic` says what each gives.
         spacing: world length of a step along x (columns) and y (rows), or one number for both; may be negative.
         origin: x, y of the first datum of the first row.
@@ -220,8 +224,10 @@ class HeightField(Surface):
 
         Which triangles these are, and their corners, `ops.heights` says; the order of coefficients is that of
         `filterlab.bernstein`. Those on an edge are the same for both its triangles, to the bit. All of a triangle in a
-        hole are NaN. Differentiable in the heights.
+        hole are NaN. Differentiable in the heights. Raises ValueError for cells of another type or shape.
         """
+        if cells.dtype is not torch.int64 or cells.shape[-1:] != (2,):
+            raise ValueError(f"cells must be int64 of shape (..., 2); got {cells.dtype} {tuple(cells.shape)}")
         found = reference.patches(self._described, cells.reshape(-1, 2), dtype)
         found = found.unflatten(1, cells.shape[:-1]) if cells.ndim > 1 else found[:, 0]
         return found if self.batched else found[0]
@@ -330,8 +336,10 @@ def _told(x: object) -> str:
 
 def _checked_heights(heights: Array) -> Tensor:
     heights = as_tensor(heights)
-    if not isinstance(heights, Tensor) or heights.is_complex() or heights.dtype is torch.bool:
-        raise TypeError(f"heights must be a real torch.Tensor or NumPy array; got {_told(heights)}")
+    if isinstance(heights, Tensor):
+        heights = heights.to(_WIDER.get(heights.dtype, heights.dtype))
+    if not isinstance(heights, Tensor) or heights.dtype not in _TYPES:
+        raise TypeError(f"heights must be a torch.Tensor or NumPy array of real numbers; got {_told(heights)}")
     if heights.ndim not in (2, 3) or not heights.numel():
         raise ValueError(f"heights must have shape (H, W) or (N, H, W), of at least one; got {tuple(heights.shape)}")
     return heights
