@@ -195,9 +195,10 @@ def _recentred(local: Quadrics, eye: Tensor, ways: Tensor) -> Tensor:
     """As `ops.reference.quadrics`, every ray with every leaf."""
     given = local.described
     rays = Rays.of(given.tree, eye, ways, False)
-    pairs = [x.repeat_interleave(len(given.leaves), 0) for x in (rays.start, rays.along, rays.first, rays.last)]
+    pairs = (x.repeat_interleave(len(given.leaves), 0) for x in (rays.start, rays.along, rays.first, rays.last))
+    start, along, first, last = pairs
     leaf = given.leaves.repeat(len(eye), 1, 1)
-    tau = intersections(leaf, *pairs, Kept(True, False, True), False)
+    tau = intersections(leaf, start, along, first, last, Kept(True, False, True), False)
     return tau.view(len(eye), -1).amin(1)
 
 

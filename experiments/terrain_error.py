@@ -32,7 +32,8 @@ ROWS = ("value", "gradient", "hessian")
 Kind = Literal["linear", "c0", "c1", "c2", "c2 prefiltered"]
 
 
-def _distinct(kinds: list[str]) -> list[str]:
+def distinct_kinds(kinds: list[str]) -> list[str]:
+    """The splines. Raises ValueError where one comes twice."""
     if len(set(kinds)) < len(kinds):
         raise ValueError(f"expected different splines; got {', '.join(kinds)}")
     return kinds
@@ -56,7 +57,7 @@ class Config(ExperimentConfig):
     """
 
     experiment: Literal["terrain_error"]
-    splines: Annotated[list[Kind], Field(min_length=1), AfterValidator(_distinct)]
+    splines: Annotated[list[Kind], Field(min_length=1), AfterValidator(distinct_kinds)]
     steps: Annotated[
         list[Annotated[int, Field(ge=12, le=4096, multiple_of=12)]], Field(min_length=1), AfterValidator(increasing)
     ]

@@ -93,6 +93,12 @@ def test_order_of_the_misfit_is_that_of_a_fit_of_second_order():
     assert np.log(few.fit.rms / many.fit.rms) / np.log(len(many) / len(few)) > 1.3
 
 
+def test_planes_need_more_balls():
+    planes = fit_slim(torus(6000), tolerance=1e-3, order=1)
+    assert (planes.A == 0).all()
+    assert len(planes) > 3 * len(torus_cover(1e-3))
+
+
 def test_ellipsoids_outside_is_found_without_normals():
     points = sphere(5000) * SEMI
     slim = fit_slim(points.astype(np.float32), tolerance=3e-4)
@@ -236,6 +242,7 @@ GOOD = sphere(200)
         (GOOD, "tolerance must be", {"tolerance": 0.5}),
         (GOOD, "tolerance must be", {"tolerance": float("nan")}),
         (GOOD, "least must be", {"least": 3}),
+        (GOOD, "order must be 1 or 2; got 3", {"order": 3}),
         (GOOD, "at least 300 points", {"least": 300}),
         (GOOD, r"normals must have shape \(200, 3\)", {"normals": GOOD[:5]}),
         (GOOD, "normals must not be 0; 200 of 200", {"normals": 0 * GOOD}),

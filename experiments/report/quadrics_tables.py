@@ -35,7 +35,7 @@ PRINTED_SETS = (
     "Marschner-Lobb|65844|26.3|40.8",
     "Fuel|36082|56.4|71.2",
 )
-PRINTED_RATES = ("Brute force|342.8|", "No clipping|600.0|", "SLIM|457.1|6.27", "Tetrahedral|400.0|2.16")
+PRINTED_RATES = ("Brute force|342.8|–", "No clipping|600.0|–", "SLIM|457.1|6.27", "Tetrahedral|400.0|2.16")
 
 
 def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section:
@@ -68,7 +68,7 @@ def _rates(config: Config, rows: Sequence[Record]) -> list[Table]:
             else "Built: whatever rays need, and four of them cast; once for as long as nothing changes. Culled: for "
             "one eye."
         )
-        tables.append(Table(columns, cells, f"{caption} {config.timed_by.capitalize()}."))
+        tables.append(Table(columns, cells, f"{caption} Measured: {config.timed_by}."))
     return tables
 
 

@@ -128,14 +128,14 @@ def _beside(own: float, printed: str | None) -> tuple[str, str, str]:
 
 
 def _derivatives(config: Config, errors: Mapping[tuple[str, int], Record]) -> Table:
-    columns = [Column("spline", numeric=False)]
-    for n in config.steps:
-        columns += [Column(f"{n} × {n}", "gradient"), Column("", "Hessian")]
-    rows = []
+    columns = [Column("steps")]
     for spline in config.splines:
-        found = [errors.get((spline, n)) for n in config.steps]
+        columns += [Column(spline, "gradient"), Column("", "Hessian")]
+    rows = []
+    for n in config.steps:
+        found = [errors.get((spline, n)) for spline in config.splines]
         pairs = [(text(r["gradient_rms"]), text(r["hessian_rms"])) if r else (MISSING, MISSING) for r in found]
-        rows.append([spline, *(cell for pair in pairs for cell in pair)])
+        rows.append([f"{n} × {n}", *(cell for pair in pairs for cell in pair)])
     return Table(columns, rows, "RMS errors of gradient and Hessian, as parts of the greatest height, per side.")
 
 

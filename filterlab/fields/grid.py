@@ -344,7 +344,7 @@ class GridField(Field):
         dtype = type_of_rays(origins, directions)
         lattice = self.lattice
         rays = in_cells(origins, directions, self.domain.geometry, lattice)
-        if level is None or not lattice.continuous:  # a jump may lie between bricks that hold no level
+        if level is None:
             return pieces_of_rays(rays, lattice, dtype)
         bounds = ranges(lattice)
         return pieces_of_rays(rays, lattice, dtype, bounds.edge // 2, bounds.may_hold(level, dtype))

@@ -131,7 +131,9 @@ def _checked(
         choice,
         stored.held(at),
         lambda: (
-            as_samples(path, stored.read(at), target) if plain else rescaled(stored.read(at), slope, intercept, target)
+            as_samples(path, stored.read(at, target), target)
+            if plain
+            else rescaled(stored.read(at), slope, intercept, target)
         ),
     )
 

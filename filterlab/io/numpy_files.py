@@ -146,7 +146,7 @@ def read_npy_header(path: Path, frame: int | None = None, channel: int | None = 
         target,
         part.choice,
         stored.held(part.at),
-        lambda: part.samples(path, stored.read(part.at), target),
+        lambda: part.samples(path, stored.read(part.at, target), target),
     )
 
 
@@ -230,7 +230,7 @@ def read_npz_header(path: Path, frame: int | None = None, channel: int | None = 
     def read() -> np.ndarray:
         with open_archive(path) as (archive, _), open_member(path, archive, info) as stream:
             stream.read(offset)
-            array = read_array(path, stream, stored_order(shape, fortran), dtype, part.at, raw=False)
+            array = read_array(path, stream, stored_order(shape, fortran), dtype, part.at, raw=False, target=target)
         return part.samples(path, array, target)
 
     return VolumeHeader(

@@ -68,5 +68,5 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
         target,
         Choice.of(path, 1, 1, frame, channel),
         0,
-        lambda: as_samples(path, stored.read(), target),
+        lambda: as_samples(path, stored.read((), target), target),
     )

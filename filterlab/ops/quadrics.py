@@ -12,6 +12,7 @@ and β² − αγ loses no digits to the distance of the eye. The ball is |ρ| �
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Self
 
@@ -145,6 +146,14 @@ class Rays:
         """(R, k) in units of the directions as they were given; ∞ stays."""
         way = self.eye[:, None] - tau if self.reversed else tau - self.eye[:, None]
         return torch.where(tau < torch.inf, (way / self.length[:, None]).clamp_min(0), torch.inf)
+
+
+def in_parts(
+    cast: Callable[[Tensor, Tensor], Sequence[Tensor]], origins: Tensor, directions: Tensor, most: int
+) -> Sequence[Tensor]:
+    """What `cast` gives of rays (R, 3), at most so many at a time, joined."""
+    found = [cast(*rays) for rays in zip(origins.split(most), directions.split(most), strict=True)]
+    return [torch.cat(rows) for rows in zip(*found, strict=True)]
 
 
 def _dot(x: Tensor, y: Tensor) -> Tensor:

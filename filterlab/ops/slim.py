@@ -18,13 +18,14 @@ raycasting of piecewise quadratic surfaces on the GPU, 2006, section 5.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from filterlab.ops.quadrics import Quadrics
+from filterlab.ops.quadrics import Quadrics, Rays
+from filterlab.ops.tree import Tree
 
 INNER = 0.5  # ρ up to which the weight is a Gaussian
 STEEP = 4.0
@@ -62,6 +63,18 @@ class Sheets(NamedTuple):
     normal: Tensor
     piece: Tensor
 
+    @classmethod
+    def none(cls, rays: Rays, count: int) -> Sheets:
+        """What programs write τ and places of sheets into, in place of t and numbers."""
+        tau = rays.first.new_full((len(rays.first), count), torch.inf)
+        normal = tau.new_zeros(*tau.shape, 3)
+        return cls(tau, tau.clone(), tau.clone(), normal, torch.full_like(tau, -1, dtype=torch.int64))
+
+    def of_rays(self, rays: Rays, tree: Tree) -> Sheets:
+        """What they have written, of rays as they were given."""
+        begin, end = (-self.end, -self.begin) if rays.reversed else (self.begin, self.end)
+        return Sheets(rays.t(self.t), begin, end, self.normal, tree.numbers(self.piece))
+
 
 class Members(NamedTuple):
     """Hits that sheets were blended of.
@@ -73,6 +86,12 @@ class Members(NamedTuple):
     row: Tensor
     piece: Tensor
     t: Tensor
+
+
+def members_of(rays: Rays, tree: Tree, row: Tensor, tau: Tensor, place: Tensor) -> Members:
+    """From τ and places (P,) of hits, in the order of rays."""
+    own = replace(rays, eye=rays.eye[row], length=rays.length[row])
+    return Members(row, tree.numbers(place), own.t(tau[:, None])[:, 0])
 
 
 def behind(end: Tensor) -> Tensor:

@@ -69,7 +69,7 @@ class Hits:
     def of_rays(self, shape: Sequence[int], dtype: torch.dtype) -> Hits:
         """In another shape and type, without derivatives."""
         piece = None if self.piece is None else self.piece.reshape(tuple(shape))
-        blend = None if self.blend is None else self.blend.detach().reshape(*shape, -1)
+        blend = None if self.blend is None else self.blend.detach().reshape(*shape, self.blend.shape[-1])
         return Hits(self.t.detach().reshape(tuple(shape)).to(dtype), piece, blend)
 
     def at(self, index: Tensor) -> Hits:

@@ -62,6 +62,7 @@ class Cover:
     """What covers a scan so far.
 
     Attributes:
+        order: of the graphs.
         least_radius: (N,) of a ball around each point.
         weight, off: (N,) sums of weights, and of weights times distances.
         graphs, cuts: of the balls that were kept, part by part.
@@ -70,6 +71,7 @@ class Cover:
 
     scan: Scan
     tolerance: float
+    order: int
     least_radius: Tensor
     weight: Tensor
     off: Tensor
@@ -79,11 +81,11 @@ class Cover:
     smallest: int = 0
 
     @classmethod
-    def of(cls, scan: Scan, tolerance: float, least: int, progress: Progress) -> Cover:
+    def of(cls, scan: Scan, tolerance: float, least: int, order: int, progress: Progress) -> Cover:
         """The whole cover."""
         farthest = scan.levels[0].tree.query(scan.points.numpy(), [least], workers=-1)[0][:, 0]
         zeros = torch.zeros(len(scan.points), dtype=torch.float64)
-        cover = cls(scan, tolerance, _ROOM * torch.from_numpy(farthest), zeros, zeros.clone())
+        cover = cls(scan, tolerance, order, _ROOM * torch.from_numpy(farthest), zeros, zeros.clone())
         cover._grow(progress)
         return cover
 
@@ -119,13 +121,13 @@ class Cover:
         if not level:
             return hopeful
         for some, pairs in scan.levels[level].parts(scan.points[numbers], radii):
-            tried = _tried(scan, numbers[some], radii[some], pairs, _DOUBTFUL * self.tolerance)
+            tried = _tried(scan, numbers[some], radii[some], pairs, _DOUBTFUL * self.tolerance, self.order)
             hopeful[some] = tried.good | tried.sharp
         return hopeful
 
     def _take_part(self, numbers: Tensor, radii: Tensor, last: Tensor, pairs: Pairs) -> Tensor:
         """(M,) which of the balls are kept."""
-        tried = _tried(self.scan, numbers, radii, pairs, self.tolerance)
+        tried = _tried(self.scan, numbers, radii, pairs, self.tolerance, self.order)
         unmet = last & ~tried.good & ~tried.sharp
         self._keep(tried.single, tried.good | unmet)
         if tried.double is not None:
@@ -160,11 +162,11 @@ class Tried(NamedTuple):
     sharp: Tensor
 
 
-def _tried(scan: Scan, numbers: Tensor, radii: Tensor, pairs: Pairs, tolerance: float) -> Tried:
+def _tried(scan: Scan, numbers: Tensor, radii: Tensor, pairs: Pairs, tolerance: float, order: int) -> Tried:
     """One graph in each ball around points; two where that does not meet the tolerance."""
     centers = scan.points[numbers]
     own, mean = _facing(scan, numbers, pairs, 0.0)
-    graphs = fitted(scan.points, own, centers, radii, mean)
+    graphs = fitted(scan.points, own, centers, radii, mean, order)
     single, good = _judged(scan, scan.spacing[numbers], graphs, own, tolerance, None)
     sharp, rest = torch.zeros_like(good), ~good
     own, _ = _facing(scan, numbers, pairs, _AWAY)
@@ -174,7 +176,7 @@ def _tried(scan: Scan, numbers: Tensor, radii: Tensor, pairs: Pairs, tolerance: 
         return Tried(single, good, None, sharp, sharp)
     side, own = side[bent[own.ball]], own.of(bent)
     rest = rest.nonzero()[:, 0][bent]
-    edges = edges_in(scan.points, scan.normals, own, side, centers[rest], radii[rest])
+    edges = edges_in(scan.points, scan.normals, own, side, centers[rest], radii[rest], order)
     spacing = scan.spacing[numbers[rest]].repeat_interleave(2)
     double, met = _judged(scan, spacing, edges.graphs, edges.pairs, tolerance, edges.cuts)
     sharp[rest] = edges.valid & met.reshape(-1, 2).all(1)

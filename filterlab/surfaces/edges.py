@@ -48,12 +48,14 @@ class Edges(NamedTuple):
     valid: Tensor
 
 
-def edges_in(points: Tensor, normals: Tensor, pairs: Pairs, side: Tensor, centers: Tensor, radii: Tensor) -> Edges:
+def edges_in(
+    points: Tensor, normals: Tensor, pairs: Pairs, side: Tensor, centers: Tensor, radii: Tensor, order: int
+) -> Edges:
     """Two graphs in every ball, and the plane between, which is found from sides (P,) of points, 0 or 1."""
     count = len(centers)
     own = pairs._replace(ball=2 * pairs.ball + side)
     for _ in range(_ROUNDS):
-        graphs = _halves(points, normals, own, centers, radii)
+        graphs = _halves(points, normals, own, centers, radii, order)
         place, both = _edge(graphs)
         across = unit(both[:, 0] - both[:, 1])
         y = (points[pairs.point] - centers[pairs.ball]) / radii[pairs.ball, None]
@@ -67,12 +69,12 @@ def edges_in(points: Tensor, normals: Tensor, pairs: Pairs, side: Tensor, center
     return Edges(graphs, own, torch.stack((plane, -plane), 1).reshape(-1, 1, 4), valid)
 
 
-def _halves(points: Tensor, normals: Tensor, pairs: Pairs, centers: Tensor, radii: Tensor) -> Graphs:
+def _halves(points: Tensor, normals: Tensor, pairs: Pairs, centers: Tensor, radii: Tensor, order: int) -> Graphs:
     """Two graphs around each centre; one without points is level."""
     rows = weight(pairs.square)[:, None] * normals[pairs.point]
     mean = unit(summed(rows, pairs.ball, 2 * len(centers)))
     mean[(mean == 0).all(1)] = mean.new_tensor([0.0, 0.0, 1.0])
-    return fitted(points, pairs, centers.repeat_interleave(2, 0), radii.repeat_interleave(2), mean)
+    return fitted(points, pairs, centers.repeat_interleave(2, 0), radii.repeat_interleave(2), mean, order)
 
 
 def ends_in(points: Tensor, ends: Tensor, spacing: Tensor, graphs: Graphs, pairs: Pairs) -> tuple[Tensor, Tensor]:

@@ -33,6 +33,7 @@ def fit_slim(
     tolerance: float = TOLERANCE,
     *,
     least: int = LEAST,
+    order: int = 2,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> Slim:
@@ -44,6 +45,7 @@ def fit_slim(
             (`surfaces.orienting`).
         tolerance: of the diagonal of the points' box, for the root mean square of distances in every ball.
         least: points in a ball, at least: more of them smooth more where noise is larger than the tolerance.
+        order: of the local fits: 2, or 1 for planes, to compare with.
         seed: of the order in which places are tried; the same one gives the same cover.
         progress: told what part is done, 0 … 1.
 
@@ -53,12 +55,15 @@ def fit_slim(
 
     Raises:
         TypeError: no such tensors. ValueError: other shapes; numbers that are not finite; fewer than `least` distinct
-            points, or all of them on a line; another tolerance than 1e-12 … 0.1; normals that are 0.
+            points, or all of them on a line; another tolerance than 1e-12 … 0.1, or order; normals that
+            are 0.
 
     Source: Ohtake, Belyaev & Alexa, Sparse low-degree implicit surfaces with applications to high quality rendering,
     feature extraction, and smoothing, 2005.
     """
     told = progress or (lambda part: None)
+    if order not in (1, 2):
+        raise ValueError(f"order must be 1 or 2; got {order!r}")
     given, sides = _checked(points, normals, tolerance, least)
     kept = _distinct(given)
     own, sides = given[kept], None if sides is None else sides[kept]
@@ -68,7 +73,7 @@ def fit_slim(
     scan, on = scan_of((own - middle) / diagonal, sides, seed, lambda part: told(_SCAN * part))
     if len(on) < least:
         raise ValueError(f"expected points close to others; of {len(own)} all but {len(on)} are strays")
-    cover = Cover.of(scan, tolerance, least, lambda part: told(_SCAN + (1 - _SCAN) * part))
+    cover = Cover.of(scan, tolerance, least, order, lambda part: told(_SCAN + (1 - _SCAN) * part))
     slim = _slim(cover, middle, diagonal)
     slim.fit = _told(cover, len(given) - len(own), len(own) - len(on), diagonal)
     return slim
@@ -110,12 +115,17 @@ def _told(cover: Cover, duplicates: int, strays: int, diagonal: float) -> Fit:
     )
 
 
-def _checked(points: Array, normals: Array | None, tolerance: float, least: int) -> tuple[Tensor, Tensor | None]:
-    """Both in float64, on the CPU, without derivatives."""
+def check_settings(tolerance: float, least: int) -> None:
+    """Raises ValueError for a tolerance or a least number of points that `fit_slim` refuses."""
     if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not _RANGE[0] <= tolerance <= _RANGE[1]:
         raise ValueError(f"tolerance must be a part of the diagonal, 1e-12 … 0.1; got {tolerance!r}")
     if isinstance(least, bool) or not isinstance(least, int) or not 6 <= least <= 1000:
         raise ValueError(f"least must be a whole number of points, 6 … 1000; got {least!r}")
+
+
+def _checked(points: Array, normals: Array | None, tolerance: float, least: int) -> tuple[Tensor, Tensor | None]:
+    """Both in float64, on the CPU, without derivatives."""
+    check_settings(tolerance, least)
     own = check_rows("points", as_tensor(points), (None, 3)).detach().double().cpu()
     if normals is None:
         return own, None

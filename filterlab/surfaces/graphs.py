@@ -89,23 +89,24 @@ class Graphs(NamedTuple):
         return A, (n - c[:, 1] * a - c[:, 2] * b) / 2, -self.radii * self.coefficients[:, 0]
 
 
-def fitted(points: Tensor, pairs: Pairs, centers: Tensor, radii: Tensor, normals: Tensor) -> Graphs:
+def fitted(points: Tensor, pairs: Pairs, centers: Tensor, radii: Tensor, normals: Tensor, order: int = 2) -> Graphs:
     """The graphs that fit best to the points of pairs.
 
     Args:
         points: (N, 3) float64.
         centers, radii: (M, 3), (M,).
         normals: (M, 3), of planes to begin with, towards the outside.
+        order: 2, or 1: planes.
     """
     found = Graphs(centers, radii, frames_of(normals), centers.new_zeros(len(centers), 6))
     for turn in range(_TURNS):
-        found = solved(points, pairs, found)
+        found = solved(points, pairs, found, order)
         if turn < _TURNS - 1:
             found = found._replace(frames=frames_of(_normals(found)))
     return found
 
 
-def solved(points: Tensor, pairs: Pairs, graphs: Graphs) -> Graphs:
+def solved(points: Tensor, pairs: Pairs, graphs: Graphs, order: int = 2) -> Graphs:
     """Fitted over the planes they have; differentiable in the points."""
     u, v, z = graphs.local(points[pairs.point], pairs.ball).unbind(-1)
     w, X, count = weight(pairs.square), _features(u, v), len(graphs.centers)
@@ -117,7 +118,9 @@ def solved(points: Tensor, pairs: Pairs, graphs: Graphs) -> Graphs:
     ridge = torch.full((count, 6), _RIDGE, dtype=sums.dtype)
     ridge[:, 3:] = torch.where(sums[:, 28:] <= _FEW, _STIFF, _RIDGE)
     matrix = matrix + torch.diag_embed(ridge * sums[:, 27:28] + torch.finfo(sums.dtype).tiny)
-    return graphs._replace(coefficients=torch.linalg.solve(matrix, sums[:, 21:27]))
+    known = 6 if order == 2 else 3
+    found = torch.linalg.solve(matrix[:, :known, :known], sums[:, 21 : 21 + known])
+    return graphs._replace(coefficients=torch.nn.functional.pad(found, (0, 6 - known)))
 
 
 def summed(rows: Tensor, ball: Tensor, count: int) -> Tensor:

@@ -178,9 +178,9 @@ def test_threads_change_nothing_but_the_order_of_sums(monkeypatch: pytest.Monkey
 
 def test_what_runs_it():
     heights, points = given(SPLINES["c1"], random(1, 4, 4)), places(1, 3)
-    assert ops.missing(heights, points) is None
-    assert "stored as" in str(ops.missing(replace(heights, values=heights.values.to(torch.int64)), points))
-    assert "float32 or float64; got torch.float16" in str(ops.missing(heights, points.half()))
+    assert ops.missing("cpu", heights, points) is None
+    assert "stored as" in str(ops.missing("cpu", replace(heights, values=heights.values.to(torch.int64)), points))
+    assert "float32 or float64; got torch.float16" in str(ops.missing("cpu", heights, points.half()))
     assert torch.equal(
         ops.jet(replace(heights, values=torch.ones(1, 4, 4, dtype=torch.int64)), points, 0), torch.ones(1, 1, 3)
     )

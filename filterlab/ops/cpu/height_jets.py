@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 from llvmlite import ir
 
-from filterlab.bernstein import multi_indices
 from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.lanes import I32, I64, STORAGE, Lanes, Value
-from filterlab.ops.heights import DEGREE, Pattern, differences, rows
+from filterlab.ops.heights import Masks, Pattern, rows
 
 # Strides are in numbers.
 FIELDS: dict[str, type] = {
@@ -250,81 +249,3 @@ class _Program:
             for lane, address in enumerate(addresses):
                 before = b.load(address, typ=e.number, align=self.storage.bytes)
                 b.store(b.fadd(before, b.extract_element(own, I32(lane))), address, align=self.storage.bytes)
-
-
-class Masks:
-    """Writes the arithmetic of one triangle: data to coefficients to derivatives, and all of it transposed."""
-
-    def __init__(self, lanes: Lanes, pattern: Pattern) -> None:
-        self.lanes, self.weights, self.first = lanes, pattern.up.weights, pattern.up.first
-
-    def coefficients(self, data: Sequence[Value]) -> list[Value]:
-        """The 15 coefficients."""
-        e = self.lanes
-        found = []
-        for weights in self.weights:
-            total = None
-            for weight, datum in zip(weights, data, strict=True):
-                total = e.multiply_add(datum, e.constant(weight), total) if weight else total
-            found.append(total)
-        return found
-
-    def derivatives(self, coefficients: list[Value], barycentric: Sequence[Value], order: int) -> list[Value]:
-        """All rows of a jet, along λ1 and λ2."""
-        found: list[Value] = []
-        for degree in range(DEGREE, -1, -1):
-            if degree <= order:
-                found = [*(self._difference(coefficients, *row) for row in rows(degree) if sum(row) == degree), *found]
-            if degree:
-                coefficients = self._step(coefficients, barycentric, degree)
-        return found
-
-    def _difference(self, coefficients: Sequence[Value], i: int, j: int) -> Value:
-        e, total = self.lanes, None
-        for place, weight in differences(i, j).items():
-            total = e.multiply_add(coefficients[place], e.constant(weight), total)
-        return total
-
-    def _step(self, coefficients: Sequence[Value], barycentric: Sequence[Value], degree: int) -> list[Value]:
-        """c_β ← Σ_k λ_k c_(β + e_k)."""
-        e, found = self.lanes, []
-        for places in _raised(degree):
-            total = None
-            for k, place in enumerate(places):
-                total = e.multiply_add(coefficients[place], barycentric[k], total)
-            found.append(total)
-        return found
-
-    def spread(self, cotangents: Sequence[Value], barycentric: Sequence[Value], order: int) -> list[Value]:
-        """Of every datum what the rows of a jet give it."""
-        e, left = self.lanes, list(cotangents)
-        coefficients: list[Value | None] = []
-        for degree in range(DEGREE + 1):
-            coefficients = self._step_back(coefficients, barycentric, degree) if degree else [None]
-            if degree <= order:
-                for row in [row for row in rows(degree) if sum(row) == degree]:
-                    own = left.pop(0)
-                    for place, weight in differences(*row).items():
-                        coefficients[place] = e.multiply_add(own, e.constant(weight), coefficients[place])
-        return [self._sum(coefficients, column) for column in zip(*self.weights, strict=True)]
-
-    def _step_back(self, lower: Sequence[Value], barycentric: Sequence[Value], degree: int) -> list[Value | None]:
-        """c_(β + e_k) += λ_k c_β."""
-        found: list[Value | None] = [None] * len(multi_indices(degree, 2))
-        for own, places in zip(lower, _raised(degree), strict=True):
-            for k, place in enumerate(places):
-                found[place] = self.lanes.multiply_add(own, barycentric[k], found[place])
-        return found
-
-    def _sum(self, coefficients: Sequence[Value], weights: Sequence[float]) -> Value:
-        e, total = self.lanes, None
-        for own, weight in zip(coefficients, weights, strict=True):
-            total = e.multiply_add(own, e.constant(weight), total) if weight else total
-        return total
-
-
-def _raised(degree: int) -> list[tuple[int, ...]]:
-    """For every |β| = degree − 1 the places of β + e_0, β + e_1, β + e_2."""
-    place = {alpha: n for n, alpha in enumerate(multi_indices(degree, 2))}
-    lower = multi_indices(degree - 1, 2)
-    return [tuple(place[tuple(b + (k == n) for n, b in enumerate(beta))] for k in range(3)) for beta in lower]

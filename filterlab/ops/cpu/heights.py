@@ -8,9 +8,7 @@ results: 8 bytes for every row and column of the heights; of splat a copy of the
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
-import torch
 from torch import Tensor
 
 from filterlab.ops.cpu import compiler
@@ -20,7 +18,7 @@ from filterlab.ops.cpu.height_jets import HeightsJob, HeightsVariant
 from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, MOST_POINTS, lanes_of, threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh, zeros
 from filterlab.ops.gather import STORAGE, readable
-from filterlab.ops.heights import Heights, rows
+from filterlab.ops.heights import Heights, Places, rows
 from filterlab.volume import Boundary
 
 _POINTS_PER_THREAD = 2048  # fewer are not worth waking a thread for
@@ -84,26 +82,12 @@ def _described(operation: str, heights: Heights, values: Tensor, points: Tensor,
     job.point(values=values, points=points, rows=rows_)
     for axis, name in enumerate(("column", "line")):
         n, letter = values.shape[-1 - axis], "xy"[axis]
-        table, first, low, high = _table(boundary, n, pattern.steps, pattern.reach, values.stride(-1 - axis))
-        job.point(**{name: table[first:]})
-        told = {"origin": heights.origin[axis], "step": pattern.steps * heights.spacing[axis], "low": low, "high": high}
-        for key, value in {**told, "size": n}.items():
+        places = Places.along(heights, axis, values.stride(-1 - axis))
+        job.point(**{name: places.table[places.zero :]})
+        told = {"origin": heights.origin[axis], "step": pattern.steps * heights.spacing[axis], "size": n}
+        for key, value in {**told, "low": places.low, "high": places.high}.items():
             setattr(job, f"{key}_{letter}", value)
     storage, zero = STORAGE[values.dtype], boundary is Boundary.ZEROS
     arithmetic = ARITHMETIC[points.dtype]
     variant = HeightsVariant(operation, pattern, order, boundary.periodic, zero, arithmetic, storage, lanes)
     return job, compiler.compiled(variant)
-
-
-@lru_cache(maxsize=64)
-def _table(boundary: Boundary, n: int, steps: int, reach: int, stride: int) -> tuple[Tensor, int, float, float]:
-    """Where every index is stored that a cell may ask for; the place of index 0; where first data of cells are.
-
-    Beyond the ends of border and zeros all data are alike: cells that reach nothing else are one.
-    """
-    if boundary.periodic:
-        low, high = 0, round(boundary.period(n) or 0)
-    else:
-        low, high = -(steps + reach + 1), n + reach
-    index = torch.arange(low - reach, high + steps + reach + 1)
-    return stride * boundary.source(index, n), reach - low, float(low), float(high)

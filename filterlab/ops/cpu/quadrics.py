@@ -13,7 +13,7 @@ from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.job import Job
 from filterlab.ops.cpu.quadric_hits import QuadricsVariant
 from filterlab.ops.cpu.tree_walk import RAYS_OF_A_CHUNK, RowsJob
-from filterlab.ops.quadrics import InLeaves, Quadrics, Rays
+from filterlab.ops.quadrics import InLeaves, Quadrics, Rays, in_parts
 
 RAYS_AT_ONCE = 1 << 18
 
@@ -35,9 +35,9 @@ def walked(
     given: InLeaves, variant: compiler.Variant, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
 ) -> tuple[Tensor, Tensor]:
     """`ops.reference.quadrics.walked`, by the program of that variant."""
-    parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-    t, piece = zip(*[_of_part(given, variant, o, d, sheets, farthest) for o, d in parts], strict=True)
-    return torch.cat(t), torch.cat(piece)
+    cast = lambda o, d: _of_part(given, variant, o, d, sheets, farthest)  # noqa: E731
+    t, piece = in_parts(cast, origins, directions, RAYS_AT_ONCE)
+    return t, piece
 
 
 def _of_part(

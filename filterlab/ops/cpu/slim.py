@@ -5,22 +5,19 @@ Memory beyond the result: 80 bytes for every ray of a part, at most `RAYS_AT_ONC
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from filterlab.ops.cpu.quadrics import RAYS_AT_ONCE, has_fma, job_of, run
 from filterlab.ops.cpu.slim_hits import MembersJob, MembersVariant, SheetsJob, SheetsVariant
-from filterlab.ops.quadrics import Rays
-from filterlab.ops.slim import Cover, Members, Sheets
+from filterlab.ops.quadrics import Rays, in_parts
+from filterlab.ops.slim import Cover, Members, Sheets, members_of
 
 
 def sheets(given: Cover, origins: Tensor, directions: Tensor, count: int, farthest: bool = False) -> Sheets:
     """`ops.reference.slim.sheets`, fused."""
-    parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-    found = [_of_part(given, Rays.of(given.quadrics.tree, o, d, farthest), count) for o, d in parts]
-    return Sheets(*(torch.cat(rows) for rows in zip(*found, strict=True)))
+    cast = lambda o, d: _of_part(given, Rays.of(given.quadrics.tree, o, d, farthest), count)  # noqa: E731
+    return Sheets(*in_parts(cast, origins, directions, RAYS_AT_ONCE))
 
 
 def members(given: Cover, origins: Tensor, directions: Tensor, begin: Tensor, end: Tensor) -> Members:
@@ -36,17 +33,12 @@ def members(given: Cover, origins: Tensor, directions: Tensor, begin: Tensor, en
     job.next, job.writes = 0, 1
     job.point(count=count.cumsum(0) - count, tau=tau, place=place)
     run(variant, job)
-    own = replace(rays, eye=rays.eye[row], length=rays.length[row])
-    return Members(row, quadrics.tree.numbers(place), own.t(tau[:, None])[:, 0])
+    return members_of(rays, quadrics.tree, row, tau, place)
 
 
 def _of_part(given: Cover, rays: Rays, count: int) -> Sheets:
-    quadrics, number = given.quadrics, len(rays.first)
-    tau = rays.first.new_full((number, count), torch.inf)
-    begin, end, normal = torch.full_like(tau, torch.inf), tau.clone(), tau.new_zeros(number, count, 3)
-    place = torch.full_like(tau, -1, dtype=torch.int64)
+    quadrics, found = given.quadrics, Sheets.none(rays, count)
     job = job_of(SheetsJob, quadrics, rays, sheets=count, offset=given.offset)
-    job.point(tau=tau, begin=begin, end=end, normal=normal, place=place)
+    job.point(tau=found.t, begin=found.begin, end=found.end, normal=found.normal, place=found.piece)
     run(SheetsVariant(quadrics.planes, quadrics.kept(rays.reversed), rays.reversed, has_fma()), job)
-    begin, end = (-end, -begin) if rays.reversed else (begin, end)
-    return Sheets(rays.t(tau), begin, end, normal, quadrics.tree.numbers(place))
+    return found.of_rays(rays, quadrics.tree)

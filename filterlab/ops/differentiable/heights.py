@@ -13,21 +13,23 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from filterlab.ops import cpu
+from filterlab.ops import cpu, cuda
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.heights import DEGREE, Heights, raised, rows, unsupported
 from filterlab.ops.reference import heights as reference
 
 
-def missing(heights: Heights, points: Tensor) -> str | None:
-    """What keeps the program from running here; None: nothing does."""
+def missing(implementation: str, heights: Heights, points: Tensor) -> str | None:
+    """What keeps "cpu" or "cuda" from running here; None: nothing does."""
     if transformed():
         return "it has no transforms of torch.func, and no torch.compile"
-    if problem := cpu.llvmlite_problem():
+    if heights.values.device != points.device:
+        return f"it works on tensors of one device; got {heights.values.device} and {points.device}"
+    if problem := cpu.llvmlite_problem() if implementation == "cpu" else cuda.device_problem(points):
         return problem
-    if heights.values.device.type != "cpu" or points.device.type != "cpu":
-        return f"it works on tensors of the CPU; got {heights.values.device} and {points.device}"
+    if implementation == "cpu" and points.device.type != "cpu":
+        return f"it works on tensors of the CPU; got {points.device}"
     return unsupported(heights, points)
 
 
@@ -35,10 +37,11 @@ def jet(heights: Heights, points: Tensor, order: int, implementation: str | None
     """The rows (N, R, P) of `ops.heights.rows` at world points (N, P, 2); see `ops.reference.heights.jet`.
 
     Args:
-        implementation: "reference" or "cpu"; None: the faster one that can run.
+        implementation: "reference", "cpu" or "cuda"; None: the fastest one that can run.
     """
     if implementation is None:
-        implementation = "cpu" if missing(heights, points) is None else "reference"
+        fused = "cuda" if points.device.type == "cuda" else "cpu"
+        implementation = fused if missing(fused, heights, points) is None else "reference"
     if implementation == "reference":
         return reference.jet(heights, points, order)
     return _jet(heights.values, points, heights, order, implementation)

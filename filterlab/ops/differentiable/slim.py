@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 from torch import Tensor
 
 from filterlab.ops.differentiable import quadrics
@@ -20,7 +22,7 @@ def sheets(
     """The first sheets of rays (R, 3) in order, or the last ones, from the last on.
 
     Args:
-        implementation: "reference" or "cpu"; None: the faster one that can run.
+        implementation: "reference", "cpu" or "cuda"; None: the fastest that can run.
     """
     return _driver(given, origins, implementation).sheets(given, origins, directions, count, farthest)
 
@@ -32,7 +34,5 @@ def members(
     return _driver(given, origins, implementation).members(given, origins, directions, begin, end)
 
 
-def _driver(given: Cover, origins: Tensor, implementation: str | None):
-    if implementation is None:
-        implementation = "cpu" if quadrics.missing(given.quadrics, origins) is None else "reference"
-    return driver(implementation, "slim")
+def _driver(given: Cover, origins: Tensor, implementation: str | None) -> ModuleType:
+    return driver(implementation or quadrics.implementation_for(given.quadrics, origins), "slim")

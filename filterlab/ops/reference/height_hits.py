@@ -103,9 +103,10 @@ def _candidates_of_part(given: HeightHits, origins: Tensor, directions: Tensor, 
         keep = found.holds
         line = found.line[:, None].expand_as(keep)[keep]
         length = own.length[line]
-        places = length * own.start[line], *(length * x[keep] for x in (found.near, found.far))
-        rows = found.coefficients[keep], torch.zeros_like(line, dtype=torch.bool), found.repeated[keep]
-        parts.append(Candidates(own.ray[line] + before, *places, *rows))
+        start, near, far = (length * x for x in (own.start[line], found.near[keep], found.far[keep]))
+        none = torch.zeros_like(line, dtype=torch.bool)
+        ray, coefficients, repeated = own.ray[line] + before, found.coefficients[keep], found.repeated[keep]
+        parts.append(Candidates(ray, start, near, far, coefficients, none, repeated))
         return torch.zeros_like(found.line, dtype=torch.bool)
 
     walk(given, own.lines, take)

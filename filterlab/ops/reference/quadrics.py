@@ -37,6 +37,7 @@ from filterlab.ops.quadrics import (
     Kept,
     Quadrics,
     Rays,
+    in_parts,
 )
 
 PAIRS_AT_ONCE = 1 << 14  # of rays and nodes, or leaves
@@ -61,10 +62,9 @@ def walked(
     given: InLeaves, meets: Meets, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
 ) -> tuple[Tensor, Tensor]:
     """The same of whatever is in the leaves of a tree, and meets rays as that function says."""
-    parts = zip(origins.split(_RAYS_AT_ONCE), directions.split(_RAYS_AT_ONCE), strict=True)
-    found = [_of_part(given, meets, o, d, sheets, farthest) for o, d in parts]
-    t, piece = zip(*found, strict=True)
-    return torch.cat(t), torch.cat(piece)
+    cast = lambda o, d: _of_part(given, meets, o, d, sheets, farthest)  # noqa: E731
+    t, piece = in_parts(cast, origins, directions, _RAYS_AT_ONCE)
+    return t, piece
 
 
 def _of_part(

@@ -5,23 +5,22 @@ Two walks for each sheet: where it ends, then all hits before that. Their number
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from filterlab.ops.quadrics import CENTER, MATRIX, SQUARE, VECTOR, Rays
+from filterlab.ops.quadrics import CENTER, MATRIX, SQUARE, VECTOR, Rays, in_parts
 from filterlab.ops.reference.quadrics import intersections, walk
-from filterlab.ops.slim import INNER, LEAST_WEIGHT, OUTER, STEEP, Cover, Members, Sheets, behind
+from filterlab.ops.slim import INNER, LEAST_WEIGHT, OUTER, STEEP, Cover, Members, Sheets, behind, members_of
 
 _RAYS_AT_ONCE = 1 << 18
 
 
 def sheets(given: Cover, origins: Tensor, directions: Tensor, count: int, farthest: bool = False) -> Sheets:
     """The first sheets of rays (R, 3) in order, or the last ones, blended from behind, from the last on."""
-    parts = zip(origins.split(_RAYS_AT_ONCE), directions.split(_RAYS_AT_ONCE), strict=True)
-    found = [_of_part(given, Rays.of(given.quadrics.tree, o, d, farthest), count) for o, d in parts]
-    return Sheets(*(torch.cat(rows) for rows in zip(*found, strict=True)))
+    cast = lambda o, d: _of_part(given, Rays.of(given.quadrics.tree, o, d, farthest), count)  # noqa: E731
+    return Sheets(*in_parts(cast, origins, directions, _RAYS_AT_ONCE))
 
 
 def members(given: Cover, origins: Tensor, directions: Tensor, begin: Tensor, end: Tensor) -> Members:
@@ -31,9 +30,7 @@ def members(given: Cover, origins: Tensor, directions: Tensor, begin: Tensor, en
     walk(given.quadrics, intersections, rays, found)
     row, tau, place = (torch.cat(rows) for rows in zip(*found.all, strict=True))
     order = row.argsort(stable=True)
-    row, tau, place = row[order], tau[order], place[order]
-    own = replace(rays, eye=rays.eye[row], length=rays.length[row])
-    return Members(row, given.quadrics.tree.numbers(place), own.t(tau[:, None])[:, 0])
+    return members_of(rays, given.quadrics.tree, row[order], tau[order], place[order])
 
 
 def weight(square: Tensor) -> Tensor:
@@ -52,13 +49,12 @@ def _of_part(given: Cover, rays: Rays, count: int) -> Sheets:
         end = ends.limit.where(begin < torch.inf, torch.inf)
         found.append(_blended(given, rays, begin, end))
         begin = behind(end)
-    tau, begin, end, normal, piece = (torch.stack(rows, 1) for rows in zip(*found, strict=True))
-    begin, end = (-end, -begin) if rays.reversed else (begin, end)
-    return Sheets(rays.t(tau), begin, end, normal, piece)
+    written = Sheets(*(torch.stack(rows, 1) for rows in zip(*found, strict=True)))
+    return written.of_rays(rays, given.quadrics.tree)
 
 
 def _blended(given: Cover, rays: Rays, begin: Tensor, end: Tensor) -> tuple[Tensor, ...]:
-    """τ, begin, end, normal and piece (R,) of the hits in between."""
+    """τ, begin, end, normal and place (R,) of the hits in between."""
     found = _Between(begin, torch.where(end < torch.inf, end, -torch.inf))
     walk(given.quadrics, intersections, rays, found)
     ray, tau, place = (torch.cat(rows) for rows in zip(*found.all, strict=True))
@@ -73,7 +69,7 @@ def _blended(given: Cover, rays: Rays, begin: Tensor, end: Tensor) -> tuple[Tens
         torch.where(end < torch.inf, begin, end),
         end,
         sums[:, 2:],
-        given.quadrics.tree.numbers(best),
+        best,
     )
 
 
