@@ -7,6 +7,7 @@ from .heights import HEIGHT_FORMATS, describe_heights, load_heights, save_height
 from .images import load_image, save_animation, save_image
 from .meshes import MESH_FORMATS, load_mesh, save_mesh
 from .points import load_points
+from .quadric_files import is_quadrics, load_quadrics, save_quadrics
 from .volumes import FORMATS, describe, load_volume, save_volume
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "describe",
     "describe_heights",
     "dump_config",
+    "is_quadrics",
     "is_slim",
     "load_affine",
     "load_config",
@@ -29,12 +31,14 @@ __all__ = [
     "load_image",
     "load_mesh",
     "load_points",
+    "load_quadrics",
     "load_slim",
     "load_volume",
     "save_animation",
     "save_heights",
     "save_image",
     "save_mesh",
+    "save_quadrics",
     "save_slim",
     "save_volume",
 ]
