@@ -1,4 +1,4 @@
-"""Where a ray crosses the quartic spline of heights on a grid, found independently: every piece sampled, every root kept.
+"""Where a ray crosses the quartic spline of heights, found independently: every piece sampled, every root kept.
 
 Nothing here imports filterlab. Masks are whole numbers over a common denominator, one for each class of coefficients;
 the others follow by the symmetries of the triangle. Planes x = i, y = j and x ± y = k (in cells) cut a ray into pieces;
@@ -24,6 +24,8 @@ STEPS = {"linear": 1, "c0": 4, "c1": 3, "c2": 1, "c2, prefiltered": 1}
 _DENOMINATORS = {"c0": 36, "c1": 48, "c2": 24}
 _MARGIN = 8  # data that are written out beyond the ends
 _NONE = 1e-12  # pieces that are shorter, of the way in the domain, are none
+
+_TOUCHES = 1e-9  # rays that are no longer than this in the domain, of t, are undecided
 
 _INDICES = [(4 - j - k, j, k) for k in range(5) for j in range(5 - k)]
 
@@ -158,9 +160,11 @@ def crossings(f: Ground, origins: np.ndarray, directions: np.ndarray, close: flo
     """Those of rays (R, 3), x and y in steps of the data, with z = s(x, y), over the domain and t ≥ 0."""
     o, d = (np.asarray(x, dtype=np.longdouble) / np.array([f.steps, f.steps, 1]) for x in (origins, directions))
     line, start, low, high, own = [], [], [], [], []
+    touching = np.zeros(len(o), dtype=bool)
     for ray in range(len(o)):
         ends = _ends(f, o[ray], d[ray])
-        if ends is not None:
+        touching[ray] = ends is not None and len(ends[1]) == 1
+        if ends is not None and not touching[ray]:
             t0, cuts = ends
             line += [ray] * (len(cuts) - 1)
             start += [t0] * (len(cuts) - 1)
@@ -168,7 +172,7 @@ def crossings(f: Ground, origins: np.ndarray, directions: np.ndarray, close: flo
             high.append(cuts[1:])
             own.append(o[ray] + t0 * d[ray])
     if not line:
-        return [Truth(np.zeros(0), np.inf)] * len(o)
+        return [Truth(np.zeros(0), 0.0 if own else np.inf) for own in touching]
     line, low, high = np.array(line), np.concatenate(low), np.concatenate(high)
     entry = np.repeat(np.array(own), np.unique(line, return_counts=True)[1], 0).astype(np.float64)
     nodes = chebyshev.chebpts1(5)
@@ -180,7 +184,8 @@ def crossings(f: Ground, origins: np.ndarray, directions: np.ndarray, close: flo
     values = f.on_pieces(cell, f.is_up(middle, cell), points[..., :2]) - points[..., 2]
     c = np.linalg.solve(chebyshev.chebvander(nodes, 4), values.T)
     start = np.array(start)
-    return _of_pieces(len(o), line, start + low, start + high, c, close)
+    found = _of_pieces(len(o), line, start + low, start + high, c, close)
+    return [Truth(one.t, 0.0) if own else one for own, one in zip(touching, found, strict=True)]
 
 
 def _of_pieces(rays: int, line, low, high, c, close: float) -> list[Truth]:
@@ -200,19 +205,19 @@ def _of_pieces(rays: int, line, low, high, c, close: float) -> list[Truth]:
 
 
 def _ends(f: Ground, o: np.ndarray, d: np.ndarray) -> tuple[np.longdouble, np.ndarray] | None:
-    """t at which a ray enters the domain, and from there on where it is cut."""
+    """t at which a ray enters the domain, and from there on where it is cut; one cut: it hardly touches it."""
     near, far = np.longdouble(0), np.longdouble(np.inf)
     low, high = np.nanmin(f.triangles, initial=np.inf) - 1, np.nanmax(f.triangles, initial=-np.inf) + 1
-    for x, v, a, b in zip(
-        o, d, (0, 0, low), (*(max(n - 1, 1) / f.steps for n in f.size), high), strict=True
-    ):
+    for x, v, a, b in zip(o, d, (0, 0, low), (*(max(n - 1, 1) / f.steps for n in f.size), high), strict=True):
         if v == 0:
             if not a <= x <= b:
                 return None
             continue
         first, last = sorted(((a - x) / v, (b - x) / v))
         near, far = max(near, first), min(far, last)
-    if not near < far:
+    if abs(far - near) <= _TOUCHES * (1 + abs(near)):
+        return near, np.zeros(1)
+    if near > far:
         return None
     o, length = o + near * d, far - near
     sign = -1 if f.mirrored else 1

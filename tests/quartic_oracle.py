@@ -7,6 +7,7 @@ towards the third one.
 
 from __future__ import annotations
 
+import math
 from itertools import permutations
 from math import factorial
 
@@ -127,23 +128,15 @@ class Oracle:
         matrix = np.linalg.inv(np.column_stack((corners, np.ones(3))).T)  # λ = matrix (x, y, 1)
         bary, rise = matrix @ (*point, 1.0), matrix[:, :2]
         coefficients = self.patch(cell, up)
-        z, g, h = 0.0, np.zeros(2), np.zeros((2, 2))
-        for alpha, c in zip(INDICES, coefficients, strict=True):
-            scale = c * 24 / np.prod([factorial(a) for a in alpha])
-            power = lambda *less: np.prod(  # noqa: E731
-                [
-                    _falling(a, k) * (b ** (a - k) if a >= k else 0.0)
-                    for a, b, k in zip(alpha, bary, less, strict=True)  # noqa: B023
-                ]
-            )
-            z += scale * power(0, 0, 0)
-            for p in range(3):
-                one = np.eye(3, dtype=int)[p]
-                g += scale * power(*one) * rise[p]
-                for q in range(3):
-                    h += scale * power(*(one + np.eye(3, dtype=int)[q])) * np.outer(rise[p], rise[q])
-        return z, g, h
+        scaled = coefficients * 24 / np.array([math.prod(map(factorial, alpha)) for alpha in INDICES])
+        unit, alpha = np.eye(3, dtype=int), np.array(INDICES)
 
+        def derivative(times):
+            """By λ, so many times by each: Σ scaled α!/(α − times)! λ^(α − times)."""
+            left = alpha - times
+            falling = np.where(times == 0, 1, np.where(times == 1, alpha, alpha * (alpha - 1)))
+            return (scaled * (falling * bary ** np.maximum(left, 0)).prod(1)).sum()
 
-def _falling(a, k):
-    return 1 if k == 0 else a if k == 1 else a * (a - 1)
+        by_one = np.array([derivative(p) for p in unit])
+        by_two = np.array([[derivative(p + q) for q in unit] for p in unit])
+        return derivative(0 * unit[0]), rise.T @ by_one, rise.T @ by_two @ rise

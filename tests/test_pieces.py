@@ -14,6 +14,7 @@ from filterlab import bernstein, kernels
 from filterlab.fields import ranges as bounds
 from filterlab.kernels import KERNELS
 from filterlab.methods import from_kernel
+from filterlab.ops.raycast import marks_of, marks_of_bits
 from filterlab.ops.reference import bounds as hulls
 from tests import oracles
 from tests.test_methods import CONTINUOUS, TENSOR_PRODUCTS
@@ -263,6 +264,28 @@ def test_bounds_are_the_hulls_of_the_cells(name, edge):
     assert bool((most - high <= within)[most.isfinite()].all())
     assert bool(least.isfinite().all())
     assert bool(most.isfinite().all())
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 2, 64), (2, 17, 129), (16, 24, 40)])
+def test_marks_are_those_of_parts_one_by_one(shape):
+    """Blocks, words and bytes against their definition, a brick at a time."""
+    generator = torch.Generator().manual_seed(sum(shape))
+    low = (torch.randn(shape, generator=generator) * 500).short()
+    high = low + 30
+    blocks = bounds.Blocks.of(low, high)
+    assert torch.equal(blocks.in_order(blocks.low, shape), low)
+    holds = (low <= 1510) & (high >= 1500)
+    assert torch.equal(blocks.straddling(1500, 1510), holds)
+    marks = marks_of_bits(blocks.bits(1500, 1510))
+    assert torch.equal(marks_of(holds), marks)
+    whole = np.zeros([2 * -(-n // 2) for n in shape], dtype=bool)
+    whole[tuple(slice(n) for n in shape)] = holds.numpy()
+    relevant = np.argwhere(whole.reshape(*(k for n in whole.shape for k in (n // 2, 2))).any((1, 3, 5)))
+    for z, y, x in np.ndindex(*marks.shape):
+        part = whole[2 * z : 2 * z + 2, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2].ravel()
+        apart = np.abs(relevant - (z, y, x)).max(1).min(initial=9)
+        expected = int(part @ (1 << np.arange(8))) if part.any() else -min(9, apart)
+        assert int(marks[z, y, x]) == expected
 
 
 def test_bounds_see_what_is_written_to_coefficients():

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from filterlab.surfaces import HeightField, Relief
-from filterlab.surfaces.base import _geometry
+from filterlab.surfaces.base import geometry
 
 F64 = torch.float64
 
@@ -67,7 +67,7 @@ def test_profile_and_tangential_curvature_are_those_of_the_surface_in_space():
     found = jet_of(lambda x, y: torch.sin(3 * x + 1) * torch.cos(2 * y) + x * y, somewhere())
     gradient = torch.cat((-found.gradient, torch.ones(50, 1, dtype=F64)), -1)
     hessian = torch.nn.functional.pad(-found.hessian, (0, 1, 0, 1))  # type: ignore[operator]
-    curvatures = _geometry(torch.zeros(50, 3), (gradient, hessian)).curvatures
+    curvatures = geometry(torch.zeros(50, 3), (gradient, hessian)).curvatures
     assert curvatures is not None
     close(found.mean_curvature, curvatures.sum(-1) / 2)
     close(found.gaussian_curvature, curvatures.prod(-1))

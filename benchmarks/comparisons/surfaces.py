@@ -13,13 +13,15 @@ from torch import Tensor
 
 from benchmarks.comparisons.scaling import thread_numbers
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, Tick, race_item, usable_cores
-from benchmarks.peers import casters, embree_mesh, mitsuba_sdfgrid, vtk_flying_edges
+from benchmarks.peers import casters, embree_mesh, isoray, mitsuba_sdfgrid, vtk_flying_edges, vtk_raycaster
 from benchmarks.peers.task import Casting
 from benchmarks.probe import measured
 from benchmarks.records import Figure, Outcome, Spread, at_least, at_most
 from benchmarks.scene import marschner_lobb
 from benchmarks.settings import Settings
 from filterlab.methods import METHODS, reconstruct
+from filterlab.render.materials import Phong
+from filterlab.render.raycast import raycast
 from filterlab.surfaces import LevelSet
 
 _LEVEL = 0.5
@@ -36,6 +38,10 @@ _BARS = {
 _BARS_TO_TRIQUADRATIC = {"qss": at_most("0.7"), "cubic-c1": at_most("0.8"), "quadratic-c1": at_most("0.7")}
 _TILED = f"{mitsuba_sdfgrid.NAME}, tile by tile"
 _PROCESSES = 3  # of which the peak memory is taken
+_BORDER = (
+    0.5  # voxels beyond the outermost samples, which are ours and no peer's: there are more hits, and earlier ones
+)
+_BISECTED = 32  # pixels along an edge of what isoray casts
 _PLAIN = 64  # pixels along an edge of what plain torch casts
 
 
@@ -88,7 +94,39 @@ def _first(settings: Settings) -> Race:
     if embree_mesh.NAME not in absent:
         ratios.append(Ratio("triquadratic", embree_mesh.NAME, at_most("2")))
     what = f"{described(task)}: first hits and normals; {embree_mesh.NAME} without"
-    return Race(what, contestants, ratios, tolerance=2e-3, absent=absent)
+    return Race(what, contestants, ratios, tolerance=_BORDER / task.volume.shape[-1], absent=absent)
+
+
+def _bisecting(settings: Settings) -> Race:
+    """Few rays: each takes as long as some hundred of ours."""
+    task, absent = task_of(settings, _BISECTED), {}
+    contestants, ratios = [_hits(task, "trilinear")], []
+    if why := isoray.missing():
+        absent[isoray.NAME] = why
+    else:
+        contestants.append(isoray.bisecting(task))
+        ratios.append(Ratio("trilinear", isoray.NAME))
+    what = f"{described(task)}: first hits and normals; {isoray.NAME} without"
+    return Race(what, contestants, ratios, tolerance=_BORDER / task.volume.shape[-1], absent=absent)
+
+
+def _renderers(settings: Settings) -> Race:
+    """Lit images. On a CPU VTK has no other way to a level set than steps, of ½ voxel, through opacity that jumps."""
+    n, size, steps = settings.image_voxels, 2 * settings.image, 512
+    above = torch.arange(steps) >= round(_LEVEL * (steps - 1))
+    table = torch.cat((torch.full((steps, 3), 0.8), above[:, None].float()), 1)
+    scene = replace(marschner_lobb(n, size), table=table, threads=settings.threads)
+    surface = LevelSet(reconstruct(scene.volume, "trilinear", gradient="analytic"), _LEVEL)
+    draw = lambda: raycast(surface, scene.camera, Phong(), size=(size, size))  # noqa: E731
+    contestants, ratios, absent = [Contestant("trilinear", draw, samples=size**2)], [], {}
+    if why := vtk_raycaster.missing():
+        absent[vtk_raycaster.NAME] = why
+    else:
+        contestants.append(vtk_raycaster.marching(scene))
+        ratios.append(Ratio("trilinear", vtk_raycaster.NAME))
+    return Race(
+        f"Marschner-Lobb {n}³ float32, level {_LEVEL:g}, lit images {size}²", contestants, ratios, absent=absent
+    )
 
 
 def _new_level(settings: Settings) -> Race:
@@ -203,6 +241,8 @@ def _memory(settings: Settings, tick: Tick) -> Outcome:
 def _items(settings: Settings) -> list[Item]:
     return [
         race_item("first", 30, _first),
+        race_item("isoray", 180, _bisecting),
+        race_item("images", 20, _renderers),
         race_item("new-level", 30, _new_level),
         race_item("plain", 60, _plain),
         race_item("backward", 10, _backward),

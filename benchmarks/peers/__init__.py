@@ -2,9 +2,9 @@
 
 A module here has `NAME`, `missing()` (why it can't take part; None: it can) and one of these: `sampling(task)`, the
 contestant for a `Sampling`, with `offers(kernel, gradient)`; `marching(scene)`, the contestant that renders a `Scene`;
-`casting(task)`, the one that casts the rays of a `Casting`; `new_level(task, level)`, the one that begins with a level
-each time. Points, coefficients and tables are handed over in the
-library's own form before anything is timed.
+`casting(task)`, the one that casts the rays of a `Casting`, or `bisecting(task)`, where that takes so long that few are
+cast; `new_level(task, level)`, the one that begins with a level each time. Points, coefficients and tables are handed
+over in the library's own form before anything is timed.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ _NAMES = (
     "mitsuba_sdfgrid",
     "embree_mesh",
     "vtk_flying_edges",
+    "isoray",
 )
 
 PEERS: tuple[ModuleType, ...] = tuple(import_module(f"benchmarks.peers.{name}") for name in _NAMES)

@@ -24,7 +24,9 @@ from filterlab.cli.resample import Resample
 from filterlab.cli.scene import Scene
 from filterlab.cli.scenes import split_overrides
 from filterlab.cli.sdf import Sdf
+from filterlab.cli.slim import Slim
 from filterlab.cli.terminal import tell
+from filterlab.cli.terrain import Terrain
 from filterlab.names import unknown_name
 from filterlab.notices import Notice
 
@@ -36,7 +38,9 @@ COMMANDS: dict[str, Any] = {
     "render": Render,
     "mesh": Mesh,
     "scene": Scene,
+    "terrain": Terrain,
     "sdf": Sdf,
+    "slim": Slim,
     "resample": Resample,
     "convert": Convert,
     "recommend": Recommend,

@@ -27,17 +27,19 @@ AT_ONCE = 2**17  # numbers
 
 @dataclass(frozen=True)
 class Info:
-    """Show what is in a file of a volume or of heights: its header, where it lies, and how its values are distributed.
+    """Show what is in a file of a volume, of heights or of a SLIM surface: its header, where it lies, and its values.
 
     examples:
       filterlab info engine.nrrd
       filterlab info dem.tif
       filterlab info scan.nii.gz --header-only
       filterlab info series.nii.gz --frame 3
+      filterlab info bunny.npz
     """
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """The volume: a file, or a folder of numbered TIFF slices; or heights (GeoTIFF, .npy, .npz, PNG of 16 bits)."""
+    """The volume: a file, or a folder of numbered TIFF slices; or heights (GeoTIFF, .npy, .npz, PNG of 16 bits); or a
+    SLIM surface (.npz)."""
     header_only: Annotated[bool, arg(aliases=["-H"])] = False
     """Do not read the voxels."""
     frame: Frame = None
@@ -48,7 +50,12 @@ class Info:
     def run(self, overrides: dict[str, str]) -> None:
         from filterlab.io.heights import holds_heights
 
-        self._tell_heights() if holds_heights(self.file) else self._tell_volume()
+        if _holds_slim(self.file):
+            _show_lines(_lines_of_slim(self.file))
+        elif holds_heights(self.file):
+            self._tell_heights()
+        else:
+            self._tell_volume()
 
     def _tell_volume(self) -> None:
         from filterlab.io.volumes import MAX_BYTES, describe
@@ -109,6 +116,31 @@ def _reference(header: HeightsHeader) -> str:
         return "not declared"
     code = header.crs if header.crs.startswith("EPSG:") else None
     return " ".join(filter(None, (header.crs_name, code and f"({code})"))) or "WKT"
+
+
+def _holds_slim(path: Path) -> bool:
+    if path.suffix.lower() != ".npz":
+        return False
+    from filterlab.io.covers import is_slim
+
+    return is_slim(path)
+
+
+def _lines_of_slim(path: Path) -> list[tuple[str, str]]:
+    """Lines about the SLIM surface in a file."""
+    from filterlab.io.covers import load_slim
+
+    slim = load_slim(path)
+    radii, cuts = slim.radii.double(), 0 if slim.cuts is None else slim.cuts.shape[1]
+    lower, upper = slim.domain.lower, slim.domain.upper
+    return [
+        ("file", f"{path} (SLIM surface)"),
+        ("balls", f"{len(slim):,}, {str(slim.A.dtype).removeprefix('torch.')}"),
+        ("radii", f"{float(radii.min()):.6g} … {float(radii.max()):.6g}, median {float(radii.median()):.6g}"),
+        ("planes", f"up to {cuts} for each" if cuts else "none: no ball is cut"),
+        ("x, y, z", "; ".join(f"{a:.6g} … {b:.6g}" for a, b in zip(lower, upper, strict=True))),
+        ("shown", f"{slim.faces} faces, blended over {slim.offset:g} radii"),
+    ]
 
 
 def _described(header: VolumeHeader) -> list[tuple[str, str]]:

@@ -89,19 +89,10 @@ class Render:
         show(table(plan(views[0]), pictures=len(views)))
 
     def _write(self, pictures: _Pictures, output: Path) -> None:
-        from filterlab.io.atomic import atomic_folder
-        from filterlab.io.images import save_animation, save_image
+        from filterlab.cli.pictures import write_pictures
         from filterlab.scenes.turntable import seconds_of_each
 
-        count = len(pictures.views)
-        if self.turntable is None:
-            save_image(next(iter(pictures)), output)
-        elif output.suffix:
-            save_animation(pictures, output, seconds=seconds_of_each(count))
-        else:
-            with atomic_folder(output) as folder:
-                for k, picture in enumerate(pictures):
-                    save_image(picture, folder / f"{k:0{max(3, len(str(count - 1)))}d}.png")
+        write_pictures(pictures, output, moving=self.turntable is not None, seconds=seconds_of_each(len(pictures)))
 
     def _output(self, output: Path) -> OutputFile:
         from filterlab.io.picture_formats import ANIMATIONS, PICTURES, format_of
@@ -123,6 +114,9 @@ class _Pictures:
     views: list[AnyPrepared]
     progress: Progress
     told: str = ""
+
+    def __len__(self) -> int:
+        return len(self.views)
 
     def __iter__(self) -> Iterator[Tensor]:
         from filterlab.scenes.build import picture

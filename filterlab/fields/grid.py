@@ -344,7 +344,7 @@ class GridField(Field):
         dtype = type_of_rays(origins, directions)
         lattice = self.lattice
         rays = in_cells(origins, directions, self.domain.geometry, lattice)
-        if level is None or not lattice.continuous:  # a jump may lie between bricks that hold no level
+        if level is None:
             return pieces_of_rays(rays, lattice, dtype)
         bounds = ranges(lattice)
         return pieces_of_rays(rays, lattice, dtype, bounds.edge // 2, bounds.may_hold(level, dtype))
@@ -360,7 +360,8 @@ class GridField(Field):
         dtype = type_of_rays(origins, directions)
         lattice = self.lattice
         bounds = ranges(lattice)
-        return Raycast(lattice, self.domain.geometry, level, dtype, bounds.marks(level, dtype), bounds.edge)
+        marks, margin = bounds.marks(level, dtype), bounds.margin(dtype)
+        return Raycast(lattice, self.domain.geometry, level, dtype, marks, bounds.edge, margin)
 
     @property
     def _caster(self) -> str | None:

@@ -33,11 +33,12 @@ from torch import Tensor
 from filterlab import bernstein, ops
 from filterlab.bernstein import Index, multi_indices
 from filterlab.fields.grid import Coefficients, Evaluation, Term, implementation_of
+from filterlab.fields.trends import Input, Piece, on_cubes, on_octahedra
 from filterlab.geometry import Geometry
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.place import Placement
 from filterlab.ops.reference.place import far_voxels
-from filterlab.ops.tetrahedra import Tetrahedra, TetrahedralStencil
+from filterlab.ops.tetrahedra import Tetrahedra, TetrahedralStencil, Trend
 from filterlab.volume import Boundary, all_between
 
 Vector = tuple[Fraction, Fraction, Fraction]
@@ -65,7 +66,7 @@ def weighted(*parts: tuple[Fraction, Mapping[Key, Fraction]]) -> dict[Key, Fract
     return {sample: weight for sample, weight in total.items() if weight}
 
 
-Coordinate = TypeVar("Coordinate", int, Fraction)
+Coordinate = TypeVar("Coordinate", int, float, Fraction)
 
 
 @dataclass(frozen=True)
@@ -203,7 +204,33 @@ class Spline:
             barycentric=tuple(tuple(tuple(map(float, row)) for row in s.barycentric) for s in self.shapes),
             norm=float(self.norm),
             cuts=tuple((normal, float(d)) for normal, d in sorted(self._cuts())),
+            trend=self._trend,
         )
+
+    @property
+    def _trend(self) -> Trend:
+        return (on_cubes if self.jets is None else on_octahedra)(self.degree, self._pieces)
+
+    @property
+    def _pieces(self) -> list[Piece]:
+        """All that fill the cube about the sample 0."""
+        found, numbers = [], [self._in_numbers(shape) for shape in range(len(self.shapes))]
+        for number, turn, shift in self._about_sample:
+            vertices, masks = numbers[number]
+            moved = {a: _turned_inputs(mask, turn, int(2 * shift)) for a, mask in masks.items()}
+            found.append((np.array([turn(v) for v in vertices]) + float(shift), moved))
+        return found
+
+    def _in_numbers(self, number: int) -> Piece:
+        """A shape, and its coefficients by what stands at places of which twice the coordinates are told."""
+        shape, inputs = self.shapes[number], {}
+        if self.jets is None:
+            for a, mask in shape.masks.items():
+                inputs[a] = {((int(2 * x), int(2 * y), int(2 * z)), 0): float(w) for (x, y, z), w in mask.items()}
+        else:
+            for a, jets in self.jets[number].items():
+                inputs[a] = {((2 * x, 2 * y, 2 * z), row): float(w) for ((x, y, z), row), w in jets.items()}
+        return np.array(shape.vertices, dtype=float), inputs
 
     @property
     def _rules(self) -> list[Mapping[Index, Weights]]:
@@ -220,16 +247,34 @@ class Spline:
     def _cuts(self) -> set[tuple[Normal, Fraction]]:
         """The planes of faces within the cube about the sample 0, in which no tetrahedron lies partly."""
         half, found = Fraction(1, 2), set()
-        for (number, turn), shift in product(self.tetrahedra, {self.shift, -self.shift}):
-            shape = self.shapes[number]
-            if all(abs(c + shift) <= half for v in shape.vertices for c in turn(v)):
-                for row in shape.barycentric:
-                    normal, d = primitive(row)
-                    normal = turn(normal)
-                    plane = upright(normal, sum(normal) * shift - d)
-                    if sum(map(abs, normal)) > 1 or abs(plane[1]) < half:
-                        found.add(plane)
+        for number, turn, shift in self._about_sample:
+            for row in self.shapes[number].barycentric:
+                normal, d = primitive(row)
+                normal = turn(normal)
+                plane = upright(normal, sum(normal) * shift - d)
+                if sum(map(abs, normal)) > 1 or abs(plane[1]) < half:
+                    found.add(plane)
         return found
+
+    @cached_property
+    def _about_sample(self) -> list[tuple[int, Turn, Fraction]]:
+        """Which tetrahedra fill the cube about the sample 0, and the place of their cells' centres along every axis."""
+        return [
+            (number, turn, shift)
+            for (number, turn), shift in product(self.tetrahedra, sorted({self.shift, -self.shift}))
+            if all(abs(c + shift) <= Fraction(1, 2) for v in self.shapes[number].vertices for c in turn(v))
+        ]
+
+
+def _turned_inputs(mask: Mapping[Input, float], turn: Turn, shift: int) -> dict[Input, float]:
+    """What stands at places, turned and moved, slopes with them."""
+    found = {}
+    for (place, row), weight in mask.items():
+        x, y, z = turn(place)
+        axis = turn.ranks.index(row - 1) if row else -1
+        sign = turn.signs[axis] if row else 1
+        found[(x + shift, y + shift, z + shift), axis + 1] = sign * weight
+    return found
 
 
 def _place(sample: Vector) -> tuple[int, int, int]:

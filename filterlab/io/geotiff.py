@@ -15,6 +15,7 @@ import importlib.util
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -240,3 +241,58 @@ def _stored(path: Path, heights: Heights, dtype: np.dtype) -> tuple[np.ndarray, 
     if (samples == nodata).any():
         raise VolumeFileError(path, f"{nodata} free to stand for no data in {dtype.name}", "a height of that number")
     return np.where(missing, nodata, samples).astype(dtype), float(nodata)
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MapPicture:
+    """A picture that lies on a map.
+
+    Attributes:
+        rgb: (H, W, 3) uint8 of a screen, sRGB; the first row in the north.
+        extent: (left, bottom, right, top) of its edges.
+        crs: as that of `Heights`.
+    """
+
+    rgb: np.ndarray
+    extent: tuple[float, float, float, float]
+    crs: str | None
+
+
+MAX_PIXELS = 2**28
+
+
+def read_picture(path: Path) -> MapPicture:
+    """The picture in a GeoTIFF: three bands (and more, which are left out) of 8 bits, or one that is grey or indexed.
+
+    Raises VolumeFileError.
+    """
+    with _opened(path) as dataset:
+        transform = dataset.transform
+        if transform.is_identity or transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
+            raise VolumeFileError(
+                path, "a picture that says where it lies, rows from the north", f"{transform!r}"[:200]
+            )
+        if dataset.width * dataset.height > MAX_PIXELS or set(dataset.dtypes) != {"uint8"}:
+            got = f"{dataset.width} × {dataset.height} of {', '.join(sorted(set(dataset.dtypes)))}"
+            raise VolumeFileError(path, f"at most {MAX_PIXELS} pixels of uint8", got)
+        bands = dataset.read([1, 2, 3] if dataset.count >= 3 else [1])
+        table = _colors(dataset) if dataset.count < 3 else None
+        bounds, crs = dataset.bounds, _reference(dataset)[0]
+    rgb = np.moveaxis(bands, 0, -1) if len(bands) == 3 else np.repeat(bands[0][..., None], 3, axis=-1)
+    rgb = rgb if table is None else table[bands[0]]
+    return MapPicture(np.ascontiguousarray(rgb), (bounds.left, bounds.bottom, bounds.right, bounds.top), crs)
+
+
+def _colors(dataset: DatasetReader) -> np.ndarray | None:
+    """(256, 3) of an indexed picture."""
+    try:
+        given = dataset.colormap(1)
+    except ValueError:
+        return None
+    table = np.zeros((256, 3), np.uint8)
+    for index, color in given.items():
+        table[index] = color[:3]
+    return table

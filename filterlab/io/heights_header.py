@@ -7,6 +7,7 @@ anything, and with the caller's `max_bytes`, before memory of that size is asked
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from filterlab.heights import DEGREE, Heights, metres_per_degree
 from filterlab.io.bounded import VolumeFileError, sample_dtype
-from filterlab.io.warned import warn
+from filterlab.io.warned import VolumeFileWarning
 
 AT_ONCE = 2**21  # samples that are turned from how they are stored into heights
 MAX_TEXT = 10_000  # of a coordinate reference system, as WKT
@@ -80,9 +81,27 @@ class HeightsHeader:
             _, bottom, _, top = heights.extent
             across, along = metres_per_degree(min(max((bottom + top) / 2, -90), 90))
             told = f"a degree is {across:.0f} m along x and {along:.0f} m along y in its middle"
-            warn(self.path, f"x and y are degrees, heights are not: in_metres() makes all of them metres ({told})")
+            tell_degrees(self.path, f"x and y are degrees ({told})", "in_metres() makes them metres")
         elif heights.looks_like_degrees:
-            warn(self.path, "x and y look like degrees, though nothing is declared: replace(heights, unit='degree')")
+            told = "x and y look like degrees, though nothing is declared"
+            tell_degrees(self.path, told, "replace(heights, unit='degree') declares them")
+
+
+class DegreesWarning(VolumeFileWarning):
+    """That x and y are degrees, or seem to be; and what to do about it in Python."""
+
+    def __init__(self, told: str, remedy: str) -> None:
+        super().__init__(f"{told}: {remedy}")
+        self.told = told
+
+    @property
+    def on_command_line(self) -> str:
+        return self.told
+
+
+def tell_degrees(path: Path, told: str, remedy: str) -> None:
+    """Warns of them."""
+    warnings.warn(DegreesWarning(f"{path}: {told}", remedy), stacklevel=2)
 
 
 def band_of(samples: np.ndarray, rows: slice, stored: np.ndarray, missing: np.ndarray | None, scaling: Pair) -> None:

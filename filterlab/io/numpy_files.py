@@ -16,7 +16,7 @@ import os
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -259,14 +259,7 @@ def _samples_name(path: Path, members: dict[str, Any]) -> str:
 
 def small_numbers(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, shape: tuple[int, ...]) -> np.ndarray:
     """The few numbers of that shape in a member, float64. Raises VolumeFileError."""
-    with open_member(path, archive, info) as stream:
-        found, fortran, dtype = array_header(path, stream)
-        if found != shape or dtype.kind not in "fiu" or dtype.itemsize > 8:
-            name = info.filename.removesuffix(_SUFFIX)
-            raise VolumeFileError(path, f"numbers of shape {shape} as {name}", f"{dtype} of shape {found}"[:100])
-        buffer = read_exactly(path, stream, math.prod(shape) * dtype.itemsize, allocate=False)
-    array = native(buffer, dtype, stored_order(shape, fortran)).astype(np.float64)
-    return array.T if fortran else array
+    return _numbers(path, archive, info, shape).astype(np.float64)
 
 
 def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]) -> np.ndarray:
@@ -281,6 +274,33 @@ def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile
     if not (spacing > 0).all():
         raise VolumeFileError(path, "a positive spacing", spacing.tolist())
     return scaled(spacing.tolist(), small("origin", (3,), np.zeros(3)).tolist())
+
+
+def _numbers(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, shape: tuple[int | None, ...]) -> np.ndarray:
+    """A member of numbers, of a shape in which None is any length, in its own type and native byte order."""
+    with open_member(path, archive, info) as stream:
+        found, fortran, dtype = array_header(path, stream)
+        fits = len(found) == len(shape) and all(n in (None, own) for n, own in zip(shape, found, strict=True))
+        if not fits or dtype.kind not in "fiu" or dtype.itemsize > 8:
+            name = info.filename.removesuffix(_SUFFIX)
+            wanted = str(shape).replace("None", "…")
+            raise VolumeFileError(path, f"numbers of shape {wanted} as {name}", f"{dtype} of shape {found}"[:100])
+        buffer = read_exactly(path, stream, math.prod(found) * dtype.itemsize, allocate=False)
+    array = native(buffer, dtype, stored_order(found, fortran))
+    return np.ascontiguousarray(array.T) if fortran else array
+
+
+def read_arrays(path: Path, shapes: Mapping[str, tuple[int | None, ...]]) -> dict[str, np.ndarray]:
+    """Those arrays of an .npz file that it has, by name; None in a shape is any length. Raises VolumeFileError."""
+    with open_archive(path) as (archive, members):
+        own = {name: members[name] for name in shapes if name in members}
+        return {name: _numbers(path, archive, info, shapes[name]) for name, info in own.items()}
+
+
+def names_of_arrays(path: Path) -> frozenset[str]:
+    """Of an .npz file. Raises VolumeFileError."""
+    with open_archive(path) as (_, members):
+        return frozenset(members)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -339,7 +359,12 @@ def _described(volume: Volume) -> str | None:
 
 def write_npz(volume: Volume, path: Path, stored: str | None = None) -> None:
     """Writes `samples` and `affine`, compressed; bfloat16 becomes float32."""
+    write_arrays(path, {"samples": _samples(path, volume, stored), "affine": volume.affine})
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray | Outgoing]) -> None:
+    """Writes arrays by name, compressed."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-        for name, data in (("samples", _samples(path, volume, stored)), ("affine", volume.affine)):
+        for name, data in arrays.items():
             with archive.open(name + _SUFFIX, "w", force_zip64=True) as stream:
                 write_array(stream, data)  # type: ignore[arg-type]

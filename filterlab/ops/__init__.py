@@ -3,6 +3,7 @@
     stencil ──▶ gather place prefilter contract march raycast bounds ─▶ reference ─▶ cpu, cuda ─▶ differentiable ─▶ here
     what is summed    descriptions of every op              plain twins    programs     choice, adjoint
     tree    ──▶ quadrics
+    masks   ──▶ heights (jet, splat) ─▶ height_hits
 
 Every op has the same five parts in the same places: what it is (`<op>`: frozen data, shapes, limits), the plain twin
 (`reference`), vector code (`cpu`), code for a GPU (`cuda`), and what makes it differentiable and chooses

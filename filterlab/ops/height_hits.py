@@ -164,10 +164,10 @@ def enclose(bounds: Tensor, edge: int, out: Tensor) -> None:
 def slack_of(heights: Heights, cell: Cell) -> float:
     """By what bounds are wider than coefficients, for rounding."""
     values = heights.values.detach()
-    if values.dtype.is_floating_point:
-        least, most = (values.nan_to_num(nan=0.0) if bool(values.isnan().any()) else values).aminmax()
-    else:
-        least, most = values.aminmax()
+    least, most = map(float, values.aminmax())
+    if least != least:  # of the others
+        known = values[~values.isnan()]
+        least, most = map(float, known.aminmax()) if len(known) else (0.0, 0.0)
     return SLACK * cell.norm * max(abs(float(least)), abs(float(most)))
 
 

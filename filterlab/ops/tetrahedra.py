@@ -34,10 +34,13 @@ Steps = tuple[int, int, int]
 Block = dict[Steps, Value]
 """Samples by their places along three axes."""
 
-_UNITS: tuple[Steps, ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+UNITS: tuple[Steps, ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 Rows = dict[MultiIndex, Value]
 """All partial derivatives of some orders, each order whole."""
+
+QUADRATICS: tuple[MultiIndex, ...] = multi_indices(2)
+"""Powers of x, y, z."""
 
 _EXCHANGES = ((0, 1), (1, 2), (0, 1))
 """Of neighbours that stand in the wrong order, to sort three."""
@@ -61,6 +64,27 @@ class Arithmetic(Protocol):
 
 
 @dataclass(frozen=True)
+class Trend:
+    """A quadratic q near a spline on the cube about a sample, and how near.
+
+    Of cubes both are made of the 27 numbers that samples are by their sums and differences: along each axis, x first,
+    the middle one, the sum of the other two, the one ahead less the one behind. Of octahedra, of what `at_centre` tells
+    of eight centres, along axes turned round where the sample's index is odd: for each of four centres the sums of its
+    value and slopes and those of the centre opposite; then so the differences.
+
+    Attributes:
+        centres: twice their places, from a sample at even indices, those opposite last; none of cubes.
+        rows: of q's coefficients of `QUADRATICS` in the place from the sample; the weights of these numbers.
+        apart: rows of weights as well: |f − q| is nowhere in the cube greater than the sum of what they give, each made
+            positive.
+    """
+
+    centres: tuple[Steps, ...]
+    rows: tuple[tuple[float, ...], ...]
+    apart: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
 class Tetrahedra:
     """A spline as numbers: what a generator of code needs to know, and nothing else.
 
@@ -80,6 +104,7 @@ class Tetrahedra:
         norm: no value is larger than this times the largest sample.
         cuts: planes (n, d), n · v = d, that cut the cube |v| ≤ ½ about a sample into parts of one tetrahedron each; of
             octahedra about a sample at even indices, v turned round along the axes of odd ones.
+        trend: what is near it.
     """
 
     octahedral: bool
@@ -92,6 +117,7 @@ class Tetrahedra:
     barycentric: tuple[tuple[tuple[float, ...], ...], ...]
     norm: float
     cuts: tuple[tuple[Steps, float], ...]
+    trend: Trend
 
     @cached_property
     def shared(self) -> tuple[tuple[tuple[int, int, int], ...], tuple[tuple[float, ...], ...]]:
@@ -335,7 +361,7 @@ class Turned:
 def at_centre(arithmetic: Arithmetic, block: Block) -> Rows:
     """Eight times the value and four times the gradient at the centre of 2³ samples."""
     total, rows = None, {}
-    for axis, unit in enumerate(_UNITS):
+    for axis, unit in enumerate(UNITS):
         ends: list[Value] = [None, None]
         for at, sample in block.items():
             own = ends[at[axis]]
@@ -548,7 +574,7 @@ class Sum:
         e, block = self.arithmetic, {}
         for at in self.places:
             total = rows[0, 0, 0]
-            for axis, unit in enumerate(_UNITS):
+            for axis, unit in enumerate(UNITS):
                 total = (e.add if at[axis] else e.subtract)(total, rows[unit])
             block[at] = total
         return block
@@ -582,7 +608,7 @@ class Sum:
 
     def spread(self, cotangents: Sequence[Value], turned: Turned) -> list[Block]:
         """The transpose of `contract`: what is added to blocks of samples; None where that is nothing."""
-        units = ((0, 0, 0), *_UNITS) if self.spline.size == 2 else self.places
+        units = ((0, 0, 0), *UNITS) if self.spline.size == 2 else self.places
         along: list[Rows] = [dict.fromkeys(units) for _ in self.spline.centres]  # type: ignore[misc]
         for (block, at), value in zip(self.spline.inputs, self._spread_inputs(cotangents, turned), strict=True):
             along[block][at] = value

@@ -6,13 +6,14 @@ from filterlab.render.dvr import render
 from filterlab.render.materials import Environment, Material, Phong, ReflectionLines, Toon
 from filterlab.render.raycast import raycast
 from filterlab.render.relief import ByAspect, ByHeight, ByNormal, BySlope, Draped, Hillshade, Lambertian, Unlit
-from filterlab.render.scenery import Haze, Sky, Water, sun
+from filterlab.render.scenery import Block, Haze, Sky, Water, sun
 from filterlab.render.shading import Light, Shading
 from filterlab.render.silhouettes import Silhouettes
 from filterlab.render.transfer import TransferFunction
 from filterlab.render.values import Plane, colored, maximum_projection, plane_values
 
 __all__ = [
+    "Block",
     "ByAspect",
     "ByHeight",
     "ByNormal",

@@ -199,6 +199,24 @@ class PerspectiveCamera(Camera):
         opacity = table.opacity(table.locate(value)).detach().masked_fill(given.values.isnan(), 0)
         points = suggestion.seen(given, opacity)
         direction = suggestion.direction_for(field) if direction is None else direction
+        return cls.of_points(points, direction, up=up, field_of_view=field_of_view, aspect=aspect, margin=margin)
+
+    @classmethod
+    def of_points(
+        cls,
+        points: Array,
+        direction: Vector,
+        *,
+        up: Vector = (0.0, 0.0, 1.0),
+        field_of_view: float = 25.0,
+        aspect: float = 1.0,
+        margin: float = 1.05,
+    ) -> Self:
+        """The camera with world points (M, 3) in view, as near as it can be, and them in the middle.
+
+        Raises ValueError as `framing`.
+        """
+        points = _vector(points).cpu()
         seen = _Seen.of(points, direction, up, aspect, margin).centered(_half_height(field_of_view))
         return cls._of(seen, up, field_of_view)
 

@@ -1,4 +1,4 @@
-"""What is around a surface out of doors: sky, haze, flat water, and a sun said by compass and altitude.
+"""What is around a surface out of doors: sky, haze, flat water, earth below, and a sun said by compass and altitude.
 
 Letters: d the unit direction of a ray, s the world distance along it, z up. Colours are linear RGB.
 """
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from filterlab.arrays import Array
 from filterlab.ops.reference.optics import dot, safe_normalize
+from filterlab.render.rays import slab
 from filterlab.render.shading import Light, like
 
 Color = Sequence[float] | Array
@@ -141,3 +142,43 @@ class Water:
         left = torch.exp(-way / self.clarity)[:, None]
         own = like(self.color, ground)
         return own + torch.where(left > 0, left * (ground - own), 0)
+
+
+@dataclass(frozen=True)
+class Block:
+    """The walls of a block of earth, where a surface ends at the sides of its domain: the cut between it and a base.
+
+    The earth is where F < 0, F the function whose zeros the surface is: below the ground of a height field.
+
+    Attributes:
+        base: z where the walls end, below the domain.
+        color: of the earth, lit from all around and by every light that a wall faces.
+    """
+
+    base: float
+    color: Color = (0.2, 0.16, 0.13)
+
+    def entry(self, origins: Tensor, directions: Tensor, lower: Sequence[float], upper: Sequence[float]) -> Tensor:
+        """World distances (R,) at which rays (R, 3) from outside go through a wall of a box; ∞ for others."""
+        near, far = slab(origins, directions, (*lower[:2], self.base), upper)
+        z = origins[:, 2] + near * directions[:, 2]
+        top, bottom = upper[2] - z, z - self.base
+        length = 1e-9 * (upper[2] - self.base)
+        return torch.where((near > 0) & (near < far) & (top > length) & (bottom > length), near, torch.inf)
+
+    def lit(self, points: Tensor, lights: Sequence[Light], lower: Sequence[float], upper: Sequence[float]) -> Tensor:
+        """Linear RGB (R, 3) of points of walls."""
+        outward = []
+        for k in range(2):
+            low, high = (points[:, k] - lower[k]).abs(), (upper[k] - points[:, k]).abs()
+            outward.append((torch.minimum(low, high), torch.where(low < high, -1.0, 1.0).to(points)))
+        along_x = outward[0][0] < outward[1][0]
+        zero = torch.zeros_like(points[:, 0])
+        normal = torch.stack(
+            (torch.where(along_x, outward[0][1], zero), torch.where(along_x, zero, outward[1][1]), zero), -1
+        )
+        light = torch.full_like(points, 0.6)
+        for source in lights:
+            if source.direction is not None:
+                light = light + dot(normal, source.toward(points)).clamp_min(0)[:, None] * like(source.color, points)
+        return like(self.color, points) * light

@@ -31,7 +31,7 @@ _NEARER = 3  # steps towards the nearest point
 _NO_AREA = 1e-12  # of the product of its diagonals, the area of a quad that has none
 
 
-class BilinearQuads(InTree):
+class BilinearQuads(InTree[described.BilinearQuads]):
     """Patches S(u, v) = (1−u)(1−v) p₁ + u (1−v) p₂ + u v p₃ + (1−u) v p₄ through the corners of quadrilaterals.
 
     Args:

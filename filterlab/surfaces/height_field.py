@@ -33,20 +33,27 @@ from filterlab.names import NAN_CHOICES
 from filterlab.ops import height_hits
 from filterlab.ops import heights as described
 from filterlab.ops.differentiable import height_hits as ops
+from filterlab.ops.differentiable import heights as jets
+from filterlab.ops.gather import STORAGE
 from filterlab.ops.reference import heights as reference
-from filterlab.surfaces.base import Hits, Surface, check_rays
+from filterlab.surfaces import sight
+from filterlab.surfaces.base import Hits, Surface, all_finite, check_rays
 from filterlab.surfaces.level_set import RAYS_AT_ONCE
-from filterlab.surfaces.sheets import sheets_of
 from filterlab.surfaces.quartic import quartic_spline
 from filterlab.surfaces.relief import Relief
+from filterlab.surfaces.sheets import sheets_of
 from filterlab.volume import Boundary
+
+_TYPES = {*STORAGE, torch.int64}
+_WIDER = {torch.uint16: torch.int32, torch.uint32: torch.int64}  # torch reads none of these
+
 
 class HeightField(Surface):
     """The ground z = s(x, y) of a quartic spline s of heights on a grid.
 
     Args:
-        heights: (H, W), or (N, H, W) for jets of many; any H, W ≥ 1, real, of any type: it is neither copied nor
-            converted, but for what `nan` says. World units. Differentiable.
+        heights: (H, W), or (N, H, W) for jets of many; any H, W ≥ 1, real: it is neither copied nor converted, but
+            for what `nan` says, and for uint16 and uint32, which become int32 and int64. World units. Differentiable.
         spline: "linear", "c0", "c1" or "c2"; `surfaces.quartic` says what each gives.
         spacing: world length of a step along x (columns) and y (rows), or one number for both; may be negative.
         origin: x, y of the first datum of the first row.
@@ -129,9 +136,66 @@ class HeightField(Surface):
             raise ValueError(f"points must have shape (..., 2): x, y; got {tuple(points.shape)}")
         return Relief(*self._explicit(points, order))
 
+    @property
+    def places(self) -> Tensor:
+        """(H, W, 2) float64: x and y of all data in the world."""
+        rows, columns = (torch.arange(n, device=self.device, dtype=torch.float64) for n in self.heights.shape[-2:])
+        x, y = (o + d * n for o, d, n in zip(self.origin, self.spacing, (columns, rows), strict=True))
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+
+    def viewshed(
+        self,
+        observer: Array | Sequence[float],
+        height: float = 1.7,
+        target: float = 0.0,
+        points: Array | None = None,
+        *,
+        earth_radius: float | None = None,
+        refraction: float = sight.REFRACTION,
+    ) -> Tensor:
+        """Which places an observer sees: those to whom the straight line meets no ground before its last 10⁻⁹.
+
+        Args:
+            observer: x, y in the world, (2,), over the domain.
+            height: of the eye above the ground there, in the unit of the heights.
+            target: of what is looked at above the ground.
+            points: (*P, 2), x and y; None: all data, (H, W).
+            earth_radius: R, in the unit of heights, x and y: ground at a distance d lies (1 − k) d² / (2 R) lower.
+                `surfaces.sight.EARTH_RADIUS` is that in metres. None: a flat earth.
+            refraction: k.
+
+        Returns:
+            (*P) bool; False in holes. Nothing is recorded.
+
+        Raises:
+            ValueError: an observer in a hole, or of another shape; a radius that is not positive.
+        """
+        return sight.viewshed(self, observer, height, target, points, earth_radius, refraction)
+
+    def horizon(
+        self,
+        observer: Array | Sequence[float],
+        azimuths: Array | Sequence[float],
+        height: float = 1.7,
+        *,
+        earth_radius: float | None = None,
+        refraction: float = sight.REFRACTION,
+    ) -> Tensor:
+        """The angle above the horizontal, in radians, over which an observer sees no ground, for every azimuth.
+
+        Args:
+            azimuths: (*P) radians from +y towards +x: clockwise from north, where y goes there.
+            observer, height, earth_radius, refraction: as for `viewshed`, which raises the same.
+
+        Returns:
+            (*P) float64, found by halving to the last bit; where there is nothing but the end of the grid, the angle to
+            that end.
+        """
+        return sight.horizon(self, observer, azimuths, height, earth_radius, refraction)
+
     def _explicit(self, points: Tensor, order: int) -> tuple[Tensor, ...]:
         n = self.heights.shape[0] if self.batched else 1
-        rows = reference.jet(self._described, points.reshape(n, -1, 2), order)
+        rows = jets.jet(self._described, points.reshape(n, -1, 2), order)
         z, *slopes = (row.reshape(points.shape[:-1]) for row in rows.unbind(1))
         if order == 0:
             return (z,)
@@ -160,8 +224,10 @@ class HeightField(Surface):
 
         Which triangles these are, and their corners, `ops.heights` says; the order of coefficients is that of
         `filterlab.bernstein`. Those on an edge are the same for both its triangles, to the bit. All of a triangle in a
-        hole are NaN. Differentiable in the heights.
+        hole are NaN. Differentiable in the heights. Raises ValueError for cells of another type or shape.
         """
+        if cells.dtype is not torch.int64 or cells.shape[-1:] != (2,):
+            raise ValueError(f"cells must be int64 of shape (..., 2); got {cells.dtype} {tuple(cells.shape)}")
         found = reference.patches(self._described, cells.reshape(-1, 2), dtype)
         found = found.unflatten(1, cells.shape[:-1]) if cells.ndim > 1 else found[:, 0]
         return found if self.batched else found[0]
@@ -228,25 +294,25 @@ class HeightField(Surface):
         return other
 
     def _first(self, origins: Tensor, directions: Tensor) -> Hits:
-        return Hits(ops.first(self._cast, origins.reshape(-1, 3), directions.reshape(-1, 3)))
+        return Hits(ops.first(self.cast, origins.reshape(-1, 3), directions.reshape(-1, 3)))
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
         parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
         return Hits(torch.cat([self._sheets_of_part(o, d, sheets, farthest) for o, d in parts]))
 
     def _sheets_of_part(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
-        found = ops.candidates(self._cast, origins, directions)
+        found = ops.candidates(self.cast, origins, directions)
         extent = self.domain.diagonal / directions.abs().amax(-1).double()
         return sheets_of(found, extent, sheets, farthest)
 
     def met(self, origins: Array, directions: Array) -> Tensor:
         origins, directions = check_rays(origins, directions)
         o, d = (x.detach().reshape(-1, 3) for x in (origins, directions))
-        return ops.met(self._cast, o, d).reshape(origins.shape[:-1])
+        return ops.met(self.cast, o, d).reshape(origins.shape[:-1])
 
     @property
-    def _cast(self) -> height_hits.HeightHits:
-        """The heights as they are now, and bounds of blocks of them."""
+    def cast(self) -> height_hits.HeightHits:
+        """What rays are cast at: the heights as they are now, and bounds of blocks of them."""
         if self.batched:
             raise ValueError(f"rays are cast at one grid; got {len(self.heights)}: make a HeightField of each")
         return self._casts[0]
@@ -270,8 +336,10 @@ def _told(x: object) -> str:
 
 def _checked_heights(heights: Array) -> Tensor:
     heights = as_tensor(heights)
-    if not isinstance(heights, Tensor) or heights.is_complex() or heights.dtype is torch.bool:
-        raise TypeError(f"heights must be a real torch.Tensor or NumPy array; got {_told(heights)}")
+    if isinstance(heights, Tensor):
+        heights = heights.to(_WIDER.get(heights.dtype, heights.dtype))
+    if not isinstance(heights, Tensor) or heights.dtype not in _TYPES:
+        raise TypeError(f"heights must be a torch.Tensor or NumPy array of real numbers; got {_told(heights)}")
     if heights.ndim not in (2, 3) or not heights.numel():
         raise ValueError(f"heights must have shape (H, W) or (N, H, W), of at least one; got {tuple(heights.shape)}")
     return heights
@@ -281,11 +349,9 @@ def _resolved(heights: Tensor, choice: str) -> Tensor:
     """Heights that are finite, or NaN where they are holes."""
     if choice not in NAN_CHOICES:
         raise ValueError(f"nan must be one of {', '.join(NAN_CHOICES)}; got {choice!r}")
-    if not heights.dtype.is_floating_point:
+    if not heights.dtype.is_floating_point or all_finite(heights.detach()):
         return heights
     unknown = ~heights.detach().isfinite()
-    if not bool(unknown.any()):
-        return heights
     if choice == "refuse":
         raise ValueError(
             f"expected finite heights; got {int(unknown.sum()):,} of {heights.numel():,} that are not: "

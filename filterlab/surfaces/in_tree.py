@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Self
+from typing import Generic, Self, TypeVar
 
 from torch import Tensor
 
@@ -19,12 +19,15 @@ _MARGIN = 1e-4  # of the diagonal, around all: rays begin outside of what they h
 _FINEST = 1e-3  # of the diagonal: as the smallest radius counts what is smaller
 
 
-class InTree(Surface):
+Leaves = TypeVar("Leaves", bound=InLeaves)
+
+
+class InTree(Surface, Generic[Leaves]):
     """The tree is built at the first hit, and again when numbers were changed in place."""
 
     max_order = 2
     in_pieces = True
-    _built: tuple[tuple[int, ...], InLeaves] | None = None
+    _built: tuple[tuple[int, ...], Leaves] | None = None
 
     @property
     @abstractmethod
@@ -34,17 +37,18 @@ class InTree(Surface):
     def with_tensors(self, tensors: Sequence[Tensor]) -> Self: ...
 
     @abstractmethod
-    def _described(self) -> InLeaves:
+    def _described(self) -> Leaves:
         """The tree, and the numbers in it as they are now."""
 
     @property
-    def _cast(self) -> InLeaves:
+    def described(self) -> Leaves:
+        """What rays are cast at."""
         versions = tuple(x._version for x in self.tensors)
         if self._built is None or self._built[0] != versions:
             self._built = versions, self._described()
         return self._built[1]
 
-    def _casting(self, found: InLeaves) -> Self:
+    def _casting(self, found: Leaves) -> Self:
         """The same surface, whose rays are cast at those."""
         other = copy.copy(self)
         other._built = tuple(x._version for x in self.tensors), found
@@ -52,14 +56,14 @@ class InTree(Surface):
 
     @property
     def detached(self) -> Self:
-        return self.with_tensors([x.detach() for x in self.tensors])._casting(self._cast)
+        return self.with_tensors([x.detach() for x in self.tensors])._casting(self.described)
 
     def _first(self, origins: Tensor, directions: Tensor) -> Hits:
-        t, piece = ops.hits(self._cast, origins.reshape(-1, 3), directions.reshape(-1, 3), 1)
+        t, piece = ops.hits(self.described, origins.reshape(-1, 3), directions.reshape(-1, 3), 1)
         return Hits(t[:, 0], piece[:, 0])
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        return Hits(*ops.hits(self._cast, origins, directions, sheets, farthest))
+        return Hits(*ops.hits(self.described, origins, directions, sheets, farthest))
 
 
 def domain_around(boxes: Boxes, radii: Tensor) -> Domain:

@@ -23,7 +23,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from filterlab.ops import quadrics as described
+from filterlab.fields.base import Field
+from filterlab.ops import quadrics as description
 from filterlab.surfaces import quadric_kinds as kinds
 from filterlab.surfaces.bounds import Bounds, check_rows
 from filterlab.surfaces.in_tree import InTree, domain_around
@@ -32,7 +33,7 @@ _ROUNDINGS = 16  # of the largest coordinate, by which bounds are larger: neighb
 _SEEN = 1e-12  # of the terms of a test, by which it has to fail
 
 
-class Quadrics(InTree):
+class Quadrics(InTree[description.Quadrics]):
     """Surfaces y·A y + 2 b·y + c = 0, y = x − o, each within its bounds.
 
     Args:
@@ -65,8 +66,8 @@ class Quadrics(InTree):
     ) -> None:
         if not isinstance(bounds, Bounds):
             raise TypeError(f"bounds must be Spheres, Tetrahedra or Planes; got {type(bounds).__name__}")
-        if faces not in described.FACES:
-            raise ValueError(f"faces must be one of {', '.join(described.FACES)}; got {faces!r}")
+        if faces not in description.FACES:
+            raise ValueError(f"faces must be one of {', '.join(description.FACES)}; got {faces!r}")
         count = len(bounds)
         self.A, self.b = check_rows("A", A, (count, 3, 3)), check_rows("b", b, (count, 3))
         self.c = check_rows("c", c, (count,))
@@ -155,6 +156,24 @@ class Quadrics(InTree):
         return cls(*kinds.joined(parts), faces=faces)
 
     @classmethod
+    def of_level_set(cls, field: Field, level: float, *, faces: str = "both") -> Quadrics:
+        """The level set of a quadratic super spline as quadrics in its tetrahedra: F = f − level.
+
+        Args:
+            field: of the method `qss`, unbatched.
+            level: a finite number.
+            faces: as of `Quadrics`; outside is where values are greater, as of a `LevelSet`, which shows the same and
+                stores nothing for it.
+
+        Where a piece is on the level everywhere nothing is hit. Raises TypeError, ValueError: another field; a level
+        that no piece has. No derivatives in what the field is made of: a `LevelSet` has them.
+
+        Source: Stoll, Gumhold & Seidel, Incremental raycasting of piecewise quadratic surfaces on the GPU, 2006,
+        sections 5 and 6.
+        """
+        return cls(*kinds.level_set(field, level), faces=faces)
+
+    @classmethod
     def joined(cls, parts: Sequence[Quadrics]) -> Quadrics:
         """All in one surface; pieces are numbered one part after the other. Raises ValueError: faces that differ."""
         faces = {part.faces for part in parts}
@@ -193,12 +212,12 @@ class Quadrics(InTree):
 
     # --- what is cast ---
 
-    def _described(self) -> described.Quadrics:
+    def _described(self) -> description.Quadrics:
         bounds, (lower, upper) = self.bounds, self.bounds.boxes.around()
         slack = _ROUNDINGS * torch.finfo(torch.float64).eps * torch.maximum(lower.abs(), upper.abs()).amax()
         planes = bounds.planes.clone()
         planes[..., 3] += (planes[..., :3] * bounds.centers[:, None]).sum(-1) - slack
-        return described.Quadrics.of(
+        return description.Quadrics.of(
             bounds.boxes, self._about_centers(), bounds.centers, bounds.radii + slack, planes, self.faces
         )
 
@@ -221,10 +240,11 @@ class Quadrics(InTree):
         """
         if self.faces == "both":
             return self
-        return self._casting(self._cast.some(self._facing(eye.detach().to(self.bounds.centers))))
+        return self._casting(self.described.some(self.facing(eye)))
 
-    def _facing(self, eye: Tensor) -> Tensor:
-        """(M,) whether some point of the bounds may face it."""
+    def facing(self, eye: Tensor) -> Tensor:
+        """(M,) whether some point within the bounds may show the side that counts to a world point (3,)."""
+        eye = eye.detach().to(self.bounds.centers)
         sign = 1 if self.faces == "front" else -1
         A, b, c = (sign * x for x in self._about_centers())
         e = eye - self.bounds.centers

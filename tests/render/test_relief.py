@@ -224,7 +224,7 @@ def test_dry_land_and_beyond_the_shore():
     for rays in (ray((0, -20, 20), (0, 1, -1)), ray((0, 30, 5), (0, 1, -1))):  # above the water; outside the domain
         given = {"background": (0.3, 0.2, 0.1), "dtype": F64}
         assert torch.equal(raycast(surface, rays, water=water, **given), raycast(surface, rays, **given))
-    with pytest.raises(ValueError, match="water goes with one sheet"):
+    with pytest.raises(ValueError, match="water and block go with one sheet"):
         raycast(surface, rays, water=water, sheets=2)
     with pytest.raises(ValueError, match="a finite level and a positive clarity"):
         Water(math.nan)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from filterlab.ops.bilinear import ACROSS, CENTER, CORNER, LENGTH, PLACE, SQUARE, TWIST, UP
 from filterlab.ops.cpu import frame
 from filterlab.ops.cpu.lanes import DOUBLE, I64, Value
-from filterlab.ops.cpu.tree_walk import Ray, Walk
+from filterlab.ops.cpu.tree_walk import Ray, Rows
 from filterlab.ops.quadrics import Kept
 from filterlab.ops.tree import WIDTH
 
@@ -43,7 +43,7 @@ class _Patch(NamedTuple):
     place: Value
 
 
-class _Program(Walk):
+class _Program(Rows):
     def leaf(self, ray: Ray, leaf: Value) -> None:
         e, b = self.lanes, self.builder
         base = e.advance(self.job.leaves, b.mul(leaf, I64(WIDTH * _ROWS)), DOUBLE)
@@ -56,7 +56,7 @@ class _Program(Walk):
             for root, counted in zip((front, back), self.counted(one, turned), strict=True):
                 rho, within = self._along(patch, root, off)
                 within = b.and_(within, b.and_(b.fcmp_ordered(">=", rho, near), b.fcmp_ordered("<=", rho, far)))
-                self.take(ray, leaf, e.add(rho, behind), b.and_(b.and_(within, counted), b.and_(valid, met)))
+                self.take(leaf, e.add(rho, behind), b.and_(b.and_(within, counted), b.and_(valid, met)))
 
     def _vector(self, base: Value, rows: slice) -> list[Value]:
         return self.rows(base, range(rows.start, rows.stop))

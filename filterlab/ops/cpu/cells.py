@@ -20,7 +20,7 @@ from types import SimpleNamespace
 from llvmlite import ir
 
 from filterlab.ops.cpu.job import AXES
-from filterlab.ops.cpu.lanes import DOUBLE, I16, I32, I64, Lanes, Value, Variable
+from filterlab.ops.cpu.lanes import DOUBLE, I1, I16, I32, I64, Lanes, Value, Variable
 from filterlab.ops.pieces import NO_MOTION
 
 _EXPONENT = 0x7FF << 52
@@ -41,6 +41,42 @@ class Found:
     cell: list[Value]
     near: Value
     far: Value
+
+
+class Gathered:
+    """Cells that rays wait in while others of their pack look for theirs. Make it before any loop.
+
+    Args:
+        lanes: of doubles.
+    """
+
+    def __init__(self, lanes: Lanes) -> None:
+        zero, none = (
+            ir.Constant(ir.VectorType(I32, lanes.count), None),
+            ir.Constant(ir.VectorType(I1, lanes.count), None),
+        )
+        self.lanes, self.builder, self._none = lanes, lanes.builder, none
+        self._mask, self._cell = lanes.variable(none), [lanes.variable(zero) for _ in AXES]
+        self._near, self._far = (lanes.variable(lanes.constant(0)) for _ in range(2))
+
+    def clear(self) -> None:
+        self._mask.value = self._none
+
+    def add(self, mask: Value, found: Found) -> None:
+        """Those under the mask."""
+        self._mask.value = self.builder.or_(self._mask.value, mask)
+        own, kept = (*found.cell, found.near, found.far), (*self._cell, self._near, self._far)
+        for variable, value in zip(kept, own, strict=True):
+            variable.value = self.lanes.where(mask, value, variable.value)
+
+    @property
+    def mask(self) -> Value:
+        return self._mask.value
+
+    @property
+    def found(self) -> Found:
+        """All of them."""
+        return Found(self.mask, [c.value for c in self._cell], self._near.value, self._far.value)
 
 
 class Walk:

@@ -5,7 +5,8 @@ together for longer, and take a tenth less time than P of one row (Marschner-Lob
 
 For a pack of P rays, until all have ended:
 
-    walk        every ray to its next cell that may hold the level (`ops.cpu.cells`)
+    walk        every ray to its next cell that may hold the level (`ops.cpu.cells`); of splines on tetrahedra every one
+                that does, of which a quadratic near the spline leaves over one in four
     restrict    the sum over taps on the ray's part in that cell, P at a time (`ops.cpu.restriction`)
     signs       one change of sign among the coefficients of f − level: there is the hit, the ray waits for the end
                 several: the part that holds the first root is looked for at once (`ops.cpu.polynomials`)
@@ -22,13 +23,13 @@ from dataclasses import dataclass
 from llvmlite import ir
 
 from filterlab.ops.cpu import frame, job
-from filterlab.ops.cpu.cells import Found, Walk
+from filterlab.ops.cpu.cells import Found, Gathered, Walk
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, I8, I32, I64, STORAGE, Lanes, Value
 from filterlab.ops.cpu.polynomials import FirstRoot, Part, Rows
 from filterlab.ops.cpu.restriction import Restriction, Section
 from filterlab.ops.cpu.taps import Grid
-from filterlab.ops.cpu.tetrahedral_restriction import TetrahedralRestriction
+from filterlab.ops.cpu.tetrahedral_restriction import Level, TetrahedralRestriction
 from filterlab.ops.raycast import JUMP, REPEATED
 from filterlab.ops.tetrahedra import LoweredStencil, TetrahedralStencil
 
@@ -54,6 +55,7 @@ FIELDS: dict[str, type] = {
     "upper": ctypes.c_void_p,  # (3) d
     "scale": ctypes.c_double,  # f − level is scale · sum + shift
     "shift": ctypes.c_double,
+    "margin": ctypes.c_double,  # that rounding may add to f − level
     "marks": ctypes.c_void_p,  # (bz, by, bx) 16 bits, see `ops.raycast.Raycast`
     **{f"bricks_{a}": ctypes.c_int64 for a in AXES},  # their number
     "edge": ctypes.c_int64,  # of a brick, log₂ of its cells
@@ -136,11 +138,13 @@ class _Program:
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         no_ends = DOUBLE(0.0), DOUBLE(0.0), DOUBLE(0.0)
         grid = Grid(j.width, j.height, I64(0), no_ends, no_ends)
+        self.level = Level(*(e.everywhere(e.scalar(x)) for x in (j.scale, j.shift, j.margin)))
         self.restriction = self._restriction_of(v.stencil, grid)
         self.search = FirstRoot(e, v.degree)
         self.walk = Walk(self.places, j)
         self._ended_at = self.places.variable(self.places.constant(-1))
         self._ended_with = e.variable(e.constant(0))
+        self._gathered = Gathered(self.places)
         self.prepare()
         with frame.every_chunk(e, j) as chunk:
             first = b.mul(chunk, I64(PACKS_OF_A_CHUNK))
@@ -151,7 +155,7 @@ class _Program:
     def _restriction_of(self, stencil: LoweredStencil, grid: Grid) -> Restriction | TetrahedralRestriction:
         e, v = self.lanes, self.variant
         if isinstance(stencil, TetrahedralStencil):
-            return TetrahedralRestriction(e, stencil, self.storage, grid, v.room)
+            return TetrahedralRestriction(e, stencil, self.storage, grid, v.room, self.level)
         return Restriction(e, stencil, v.degree, self.storage, grid, v.room)
 
     def _rays_of(self, pack: Value) -> list[Value]:
@@ -195,13 +199,31 @@ class _Program:
         walk.begin(*(self._vectors(array, rays) for array in (self.job.origins, self.job.directions)))
         going = lambda: e.any(b.and_(walk.going.value, b.not_(self.waiting())))  # noqa: E731
         with e.repeat_while(going):
-            found = walk.next_cells(self.waiting())
-            with b.if_then(e.any(found.mask)):
-                start, end = (self._within(found.cell, s) for s in (found.near, found.far))
-                place = self._taps(found.cell), found.cell, start, end, found.mask, self.waiting
-                with self.restriction.every(*place) as section:
-                    self.take(rays, self._piece(found, section))
+            found = self._next_cells()
+            with (
+                b.if_then(e.any(found.mask)),
+                self.restriction.every(*self._place(found), found.mask, self.waiting) as section,
+            ):
+                self.take(rays, self._piece(found, section))
         self.finish(rays)
+
+    def _next_cells(self) -> Found:
+        """To the next cell of every ray that may hold the level; of splines on tetrahedra, that does near its way."""
+        if not isinstance(self.restriction, TetrahedralRestriction):
+            return self.walk.next_cells(self.waiting())
+        e, b, gathered = self.lanes, self.builder, self._gathered
+        gathered.clear()
+        waiting = lambda: b.or_(self.waiting(), gathered.mask)  # noqa: E731
+        with e.repeat_while(lambda: e.any(b.and_(self.walk.going.value, b.not_(waiting())))):
+            found = self.walk.next_cells(waiting())
+            with b.if_then(e.any(found.mask)):
+                gathered.add(self.restriction.look(*self._place(found), found.mask), found)
+        return gathered.found
+
+    def _place(self, found: Found) -> tuple[list[Value], list[Value], list[Value], list[Value]]:
+        """First taps, cells, and where rays enter and leave them."""
+        start, end = (self._within(found.cell, s) for s in (found.near, found.far))
+        return self._taps(found.cell), found.cell, start, end
 
     def _vectors(self, array: Value, rays: Sequence[Value]) -> list[Value]:
         """x, y, z of a pack of rays as doubles."""
@@ -220,8 +242,7 @@ class _Program:
     def _piece(self, found: Found, section: Section) -> Piece:
         e, b, p, v = self.lanes, self.builder, self.places, self.variant
         found = self._of_section(found, section)
-        scale, shift = (e.everywhere(e.scalar(x)) for x in (self.job.scale, self.job.shift))
-        rows = [e.multiply_add(c, scale, shift) for c in section.rows]
+        rows = [e.multiply_add(c, self.level.scale, self.level.shift) for c in section.rows]
         sum_ = rows[0]
         for r in rows[1:]:
             sum_ = e.add(sum_, r)

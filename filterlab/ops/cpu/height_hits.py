@@ -1,7 +1,7 @@
 """Casting rays at splines of heights as vector code: describes grids and rays to `height_hulls` and `height_rays`.
 
-Memory beyond the result: 72 bytes for every ray of a part, at most `RAYS_AT_ONCE` of them; 8 bytes for every row and
-column of the data.
+Memory beyond the result: 8 bytes for every row and column of the data; for candidates 25 + 40 bytes for every ray and
+each of the `capacity` that there is room for.
 """
 
 from __future__ import annotations
@@ -16,14 +16,11 @@ from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.height_hulls import HeightHullsJob, HeightHullsVariant
 from filterlab.ops.cpu.height_rays import LANES, PACKS_OF_A_CHUNK, HeightRaysJob, HeightRaysVariant
 from filterlab.ops.cpu.job import Job
+from filterlab.ops.cpu.memory import ARITHMETIC
 from filterlab.ops.gather import STORAGE, in_whole_rows
 from filterlab.ops.height_hits import DEGREE, Cell, HeightHits, Pyramid, data_of_windows, slack_of
 from filterlab.ops.heights import Heights
 from filterlab.ops.raycast import Candidates, Written, written_in_parts
-from filterlab.ops.reference.height_hits import entered
-from filterlab.ops.reference.pieces import Lines
-
-RAYS_AT_ONCE = 1 << 18
 
 
 def pyramid(heights: Heights, cell: Cell) -> Pyramid:
@@ -41,53 +38,50 @@ def pyramid(heights: Heights, cell: Cell) -> Pyramid:
 
 def first(given: HeightHits, origins: Tensor, directions: Tensor) -> Tensor:
     """`ops.reference.height_hits.first`, fused."""
-    return _in_parts(given, "first", origins, directions)
+    return _first(given, "first", origins, directions)
 
 
 def met(given: HeightHits, origins: Tensor, directions: Tensor) -> Tensor:
     """`ops.reference.height_hits.met`, fused: without the root search."""
-    return _in_parts(given, "met", origins, directions) < math.inf
+    return _first(given, "met", origins, directions) < math.inf
 
 
-def _in_parts(given: HeightHits, asked: str, origins: Tensor, directions: Tensor) -> Tensor:
+def _first(given: HeightHits, asked: str, origins: Tensor, directions: Tensor) -> Tensor:
     """t (R,) float64 of first hits; of "met" any where there is one."""
-    t = torch.full((len(origins),), math.inf, dtype=torch.float64)
-    parts = zip(*(x.split(RAYS_AT_ONCE) for x in (t, origins, directions)), strict=True)
-    for own, o, d in parts:
-        lines = entered(given, o, d)
-        s = torch.empty(-(-len(lines.ray) // LANES) * LANES, dtype=torch.float64)
-        _cast(given, asked, lines.lines, s=s)
-        own[lines.ray] = lines.t(s[: len(lines.ray)])
-    return t
+    t = torch.empty(-(-len(origins) // LANES) * LANES, dtype=torch.float64)
+    _cast(given, asked, origins, directions, t=t)
+    return t[: len(origins)]
 
 
 def candidates(given: HeightHits, origins: Tensor, directions: Tensor) -> Candidates:
     """`ops.reference.height_hits.candidates`, fused."""
 
     def write(rays: Tensor, capacity: int) -> Written:
-        own = lines.lines.chosen(rays)
         written = Written.room(len(rays), capacity, DEGREE, torch.float64, rays.device)
-        _cast(given, "candidates", own, capacity=capacity, **written._asdict())
+        _cast(given, "candidates", origins[rays], directions[rays], capacity, **written._asdict())
         return written
 
-    lines = entered(given, origins, directions)
-    found = written_in_parts(write, DEGREE, len(lines.ray), origins.device)
-    start, length = lines.start[found.ray], lines.length[found.ray]
-    places = length * start, length * found.near, length * found.far
-    return Candidates(lines.ray[found.ray], *places, *found[4:])
+    return written_in_parts(write, DEGREE, len(origins), origins.device)
 
 
-def _cast(given: HeightHits, asked: str, lines: Lines, capacity: int = 0, **results: Tensor) -> None:
-    if not len(lines.near):
+def _cast(
+    given: HeightHits, asked: str, origins: Tensor, directions: Tensor, capacity: int = 0, **results: Tensor
+) -> None:
+    if not len(origins):
         return
-    job, pyramid = HeightRaysJob(lines=len(lines.near), capacity=capacity, top=given.pyramid.top), given.pyramid
-    job.cells_x, job.cells_y = given.heights.cells
-    job.chunks = -(-len(lines.near) // (LANES * PACKS_OF_A_CHUNK))
+    heights, pyramid = given.heights, given.pyramid
+    job = HeightRaysJob(rays=len(origins), capacity=capacity, top=pyramid.top)
+    job.cells_x, job.cells_y = heights.cells
+    job.shift_x, job.shift_y = heights.origin
+    job.spacing_x, job.spacing_y = (given.cell.steps * d for d in heights.spacing)
+    (job.end_x, job.end_y), (job.low_z, job.high_z) = given.domain, pyramid.range
+    job.chunks = -(-len(origins) // (LANES * PACKS_OF_A_CHUNK))
     starts, widths = (torch.tensor(x) for x in (pyramid.starts, [w for _, w in pyramid.sizes]))
-    rays = {name: x.contiguous() for name, x in zip(("origins", "directions", "far"), (*lines[:2], lines.far), strict=True)}
+    dtype = torch.promote_types(origins.dtype, directions.dtype)
+    rays = {"origins": origins.to(dtype).contiguous(), "directions": directions.to(dtype).contiguous()}
     job.point(bounds=pyramid.numbers, starts=starts, widths=widths, **rays, **results)
-    _point_to(job, given.heights, given.cell)
-    _run(HeightRaysVariant(asked, given.cell, STORAGE[given.heights.values.dtype]), job)
+    _point_to(job, heights, given.cell)
+    _run(HeightRaysVariant(asked, given.cell, STORAGE[heights.values.dtype], ARITHMETIC[dtype]), job)
 
 
 def _point_to(job: Job, heights: Heights, cell: Cell) -> None:

@@ -24,9 +24,10 @@ from llvmlite import ir
 from filterlab import bernstein
 from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.height_cells import GRID, LOWER, UPPER, Windows
-from filterlab.ops.cpu.lanes import DOUBLE, FLOAT, I1, I8, I64, STORAGE, Lanes, Value
+from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, FLOAT, I1, I8, I64, STORAGE, Lanes, Value
 from filterlab.ops.cpu.polynomials import FirstRoot, Rows
 from filterlab.ops.height_hits import DEGREE, POINTS, Cell
+from filterlab.ops.pieces import NO_MOTION
 from filterlab.ops.raycast import REPEATED
 
 LANES = 4
@@ -34,7 +35,7 @@ PACKS_OF_A_CHUNK = 16
 _N = DEGREE + 1
 _NOTHING, _INNER, _AT_START, _AT_END = range(4)
 
-# Arrays are contiguous; L lines, d a double.
+# Arrays are contiguous; R rays, d a double.
 FIELDS: dict[str, type] = {
     "next": ctypes.c_int64,  # the chunk to be taken next; threads add 1 atomically
     **GRID,
@@ -44,16 +45,17 @@ FIELDS: dict[str, type] = {
     "starts": ctypes.c_void_p,  # int64 of every level
     "widths": ctypes.c_void_p,  # int64 of every level, blocks of a row
     "top": ctypes.c_int64,
-    "origins": ctypes.c_void_p,  # (L, 3) d, in cells
-    "directions": ctypes.c_void_p,  # (L, 3) d
-    "far": ctypes.c_void_p,  # (L) d
-    "lines": ctypes.c_int64,
-    "s": ctypes.c_void_p,  # (L) d, written, in whole packs: of the first hit
-    "capacity": ctypes.c_int64,  # K, candidates of a line that there is room for
-    "count": ctypes.c_void_p,  # (L) int64, written: candidates of a line, also those that there is no room for
-    "places": ctypes.c_void_p,  # (L, K, 3) d, written: 0, near, far
-    "pieces": ctypes.c_void_p,  # (L, K, 5) d, written
-    "flags": ctypes.c_void_p,  # (L, K) bytes of `REPEATED`, written
+    **dict.fromkeys(("shift_x", "shift_y", "spacing_x", "spacing_y"), ctypes.c_double),  # of cells in the world
+    **dict.fromkeys(("end_x", "end_y", "low_z", "high_z"), ctypes.c_double),  # of the box around all; from 0, 0
+    "origins": ctypes.c_void_p,  # (R, 3) numbers, in the world
+    "directions": ctypes.c_void_p,  # (R, 3) numbers
+    "rays": ctypes.c_int64,
+    "t": ctypes.c_void_p,  # (R) d, written, in whole packs: of the first hit
+    "capacity": ctypes.c_int64,  # K, candidates of a ray that there is room for
+    "count": ctypes.c_void_p,  # (R) int64, written: candidates of a ray, also those that there is no room for
+    "places": ctypes.c_void_p,  # (R, K, 3) d, written: start, near, far
+    "pieces": ctypes.c_void_p,  # (R, K, 5) d, written
+    "flags": ctypes.c_void_p,  # (R, K) bytes of `REPEATED`, written
     "chunks": ctypes.c_int64,  # `next` stops here
 }
 
@@ -70,11 +72,13 @@ class HeightRaysVariant:
         asked: "first", "met" or "candidates".
         cell: what the coefficients of a cell are made of.
         storage: dtype of the heights.
+        rays: "float32" or "float64".
     """
 
     asked: str
     cell: Cell
     storage: str
+    rays: str
 
     def generate(self) -> str:
         """The program as LLVM IR text."""
@@ -85,13 +89,25 @@ class HeightRaysVariant:
 
 @dataclass(frozen=True)
 class _Line:
-    """One line: its number, and doubles along x, y, z."""
+    """A ray from where it enters the box around all heights, in coordinates of cells.
+
+    Attributes:
+        number: of the ray.
+        origin, direction: doubles along x, y, z.
+        start: how far the origin is from that of the ray. far: where it leaves. length: of the direction, in units of
+            the ray's own. Doubles.
+        forward: integers, 1 where x and y grow.
+        meets: whether it meets the box.
+    """
 
     number: Value
     origin: list[Value]
     direction: list[Value]
+    start: Value
     far: Value
+    length: Value
     forward: list[Value]
+    meets: Value
 
     def at(self, e: Lanes, axis: int, s: Value) -> Value:
         return e.multiply_add(s, self.direction[axis], self.origin[axis])
@@ -119,7 +135,7 @@ class _Program:
         self.prepare()
         with frame.every_chunk(e, j) as chunk:
             begin = b.mul(chunk, I64(LANES * PACKS_OF_A_CHUNK))
-            end = e.smaller(b.add(begin, I64(LANES * PACKS_OF_A_CHUNK)), j.lines)
+            end = e.smaller(b.add(begin, I64(LANES * PACKS_OF_A_CHUNK)), j.rays)
             with e.repeat(begin, end, LANES) as first:
                 self.begin()
                 with e.repeat(first, e.smaller(b.add(first, I64(LANES)), end)) as number:
@@ -146,17 +162,53 @@ class _Program:
         return self.builder.load(self.lanes.advance(array, index, DOUBLE), typ=DOUBLE)
 
     def _line(self, number: Value) -> _Line:
-        b, j = self.builder, self.job
-        places = [b.add(b.mul(number, I64(3)), I64(axis)) for axis in range(3)]
-        origin, direction = ([self._number(array, p) for p in places] for array in (j.origins, j.directions))
-        forward = [b.zext(b.fcmp_ordered(">", d, DOUBLE(0.0)), I64) for d in direction]
-        return _Line(number, origin, direction, self._number(j.far, number), forward)
+        """As `ops.reference.height_hits.entered` says."""
+        e, b, j = self.lanes, self.builder, self.job
+        zero, one = DOUBLE(0.0), DOUBLE(1.0)
+        origin, direction = (self._world(array, number) for array in (j.origins, j.directions))
+        for axis, (shift, spacing) in enumerate(((j.shift_x, j.spacing_x), (j.shift_y, j.spacing_y))):
+            origin[axis] = e.divide(e.subtract(origin[axis], shift), spacing)
+            direction[axis] = e.divide(direction[axis], spacing)
+        sizes = [self._size(d) for d in direction]
+        length = e.divide(one, e.maximum(e.maximum(sizes[0], sizes[1]), sizes[2]))
+        direction = [e.multiply(d, length) for d in direction]
+        box = list(zip((zero, zero, j.low_z), (j.end_x, j.end_y, j.high_z), strict=True))
+        start, last, moving = zero, DOUBLE(math.inf), []
+        for o, d, (low, high) in zip(origin, direction, box, strict=True):
+            still = b.fcmp_ordered("<=", self._size(d), DOUBLE(NO_MOTION))
+            first, second = (e.divide(e.subtract(end, o), b.select(still, one, d)) for end in (low, high))
+            within = b.and_(b.fcmp_ordered(">=", o, low), b.fcmp_ordered("<=", o, high))
+            near, far = DOUBLE(-math.inf), DOUBLE(math.inf)
+            near, far = b.select(within, near, far), b.select(within, far, near)
+            start = e.maximum(b.select(still, near, e.minimum(first, second)), start)
+            last = e.minimum(b.select(still, far, e.maximum(first, second)), last)
+            moving.append(b.select(still, zero, d))
+        entry = [
+            e.minimum(e.maximum(e.multiply_add(start, d, o), low), high)
+            for o, d, (low, high) in zip(origin, moving, box, strict=True)
+        ]
+        forward = [b.zext(b.fcmp_ordered(">", d, zero), I64) for d in moving[:2]]
+        meets = b.fcmp_ordered("<=", start, last)
+        return _Line(number, entry, moving, start, e.subtract(last, start), length, forward, meets)
+
+    def _world(self, array: Value, number: Value) -> list[Value]:
+        """x, y, z as doubles."""
+        b, kind, found = self.builder, ARITHMETIC[self.variant.rays], []
+        for axis in range(3):
+            place = self.lanes.advance(array, b.add(b.mul(number, I64(3)), I64(axis)), kind)
+            one = b.load(place, typ=kind)
+            found.append(one if kind == DOUBLE else b.fpext(one, DOUBLE))
+        return found
+
+    def _size(self, a: Value) -> Value:
+        """|a| of one double."""
+        return self.lanes.maximum(a, self.builder.fneg(a))
 
     def _walk(self, line: _Line, lane: Value) -> None:
         e, b, j = self.lanes, self.builder, self.job
         for own, place, count in zip(self.cell_at, line.origin[:2], (j.cells_x, j.cells_y), strict=True):
             own.value = self._cell_of(place, I64(0), b.sub(count, I64(1)))
-        self.level.value, self.going.value = j.top, I1(1)
+        self.level.value, self.going.value = j.top, line.meets
         self.s.value, self.ended_at.value, self.ended_with.value = DOUBLE(0.0), DOUBLE(-1.0), DOUBLE(0.0)
         with e.repeat_while(lambda: self.going.value):
             self._step(line, lane)
@@ -172,7 +224,7 @@ class _Program:
         return self.builder.select(self.builder.icmp_signed(">", a, c), a, c)
 
     def _step(self, line: _Line, lane: Value) -> None:
-        e, b, j = self.lanes, self.builder, self.job
+        e, b = self.lanes, self.builder
         level, s = self.level.value, self.s.value
         cell = [own.value for own in self.cell_at]
         ways = [self._way(line, axis, cell[axis], level) for axis in range(2)]
@@ -203,9 +255,7 @@ class _Program:
         start, width = (b.load(e.advance(array, own, I64), typ=I64) for array in (j.starts, j.widths))
         x, y = (b.ashr(n, level) for n in cell)
         block = e.advance(j.bounds, b.shl(b.add(start, b.add(b.mul(y, width), x)), I64(1)), FLOAT)
-        low, high = (
-            b.fpext(b.load(e.advance(block, I64(k), FLOAT), typ=FLOAT), DOUBLE) for k in range(2)
-        )
+        low, high = (b.fpext(b.load(e.advance(block, I64(k), FLOAT), typ=FLOAT), DOUBLE) for k in range(2))
         first, last = (line.at(e, 2, at) for at in (s, out))
         below = b.fcmp_ordered("<=", e.minimum(first, last), high)
         return b.and_(below, b.fcmp_ordered(">=", e.maximum(first, last), low))
@@ -369,15 +419,16 @@ class _First(_Program):
         e = self.lanes
         self.search = FirstRoot(e, DEGREE)
         self.rows = e.reserve(DOUBLE, _N * LANES)
-        self.a, self.h, self.near, self.far = (e.reserve(DOUBLE, LANES) for _ in range(4))
+        self.a, self.h, self.near, self.far, self.start, self.length = (e.reserve(DOUBLE, LANES) for _ in range(6))
         self.kind = e.reserve(I64, LANES)
 
     def begin(self) -> None:
         e, one, zero = self.lanes, self.lanes.constant(1), self.lanes.constant(0)
         for n in range(_N):
             e.store(one, e.advance(self.rows, I64(n * LANES), DOUBLE))
-        for place, value in ((self.a, zero), (self.h, one), (self.near, zero), (self.far, zero)):
-            e.store(value, place)
+        for place in (self.a, self.near, self.far, self.start, self.length):
+            e.store(zero, place)
+        e.store(one, self.h)
         e.store(e.integers(_NOTHING), self.kind)
 
     def take(self, line: _Line, lane: Value, rows: Rows, near: Value, far: Value, repeated: Value) -> None:
@@ -406,7 +457,8 @@ class _First(_Program):
         with b.if_then(b.icmp_signed("!=", kind.value, I64(_NOTHING))):
             self.going.value = I1(0)
             b.store(kind.value, e.advance(self.kind, lane, I64))
-            for array, value in ((self.near, near), (self.far, far)):
+            ends = (self.near, near), (self.far, far), (self.start, line.start), (self.length, line.length)
+            for array, value in ends:
                 b.store(value, e.advance(array, lane, DOUBLE))
 
     def _keep(self, lane: Value, rows: Rows, a: Value, h: Value) -> None:
@@ -420,6 +472,7 @@ class _First(_Program):
         e, b = self.lanes, self.builder
         kind = e.load(self.kind, I64, LANES)
         a, h, near, far = (e.load(x, DOUBLE, LANES) for x in (self.a, self.h, self.near, self.far))
+        start, length = (e.load(x, DOUBLE, LANES) for x in (self.start, self.length))
         is_ = lambda k: b.icmp_signed("==", kind, e.integers(k))  # noqa: E731
         within = e.variable(e.constant(0))
         if self.variant.asked == "first":
@@ -428,8 +481,8 @@ class _First(_Program):
                 within.value = e.multiply_add(self.search.root(rows, is_(_INNER)), h, a)
         own = e.where(is_(_AT_START), e.constant(0), e.where(is_(_AT_END), e.constant(1), within.value))
         s = e.minimum(e.maximum(e.multiply_add(e.subtract(far, near), own, near), near), far)
-        found = e.where(is_(_NOTHING), e.constant(math.inf), s)
-        e.store(found, e.advance(self.job.s, first, DOUBLE))
+        found = e.where(is_(_NOTHING), e.constant(math.inf), e.multiply(length, e.add(start, s)))
+        e.store(found, e.advance(self.job.t, first, DOUBLE))
 
 
 class _Candidates(_Program):
@@ -449,9 +502,9 @@ class _Candidates(_Program):
         with b.if_then(b.icmp_signed("<", count, j.capacity)):
             index = b.add(b.mul(line.number, j.capacity), count)
             flag = b.select(repeated, I8(REPEATED), I8(0))
-            arrays = (j.places, [DOUBLE(0.0), near, far], DOUBLE), (j.pieces, rows, DOUBLE), (j.flags, [flag], I8)
+            places = [e.multiply(line.length, x) for x in (line.start, near, far)]
+            arrays = (j.places, places, DOUBLE), (j.pieces, rows, DOUBLE), (j.flags, [flag], I8)
             for array, numbers, kind in arrays:
                 for n, number in enumerate(numbers):
                     b.store(number, e.advance(array, b.add(b.mul(index, I64(len(numbers))), I64(n)), kind))
         self.count.value = b.add(count, I64(1))
-

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
+from filterlab.ops.cpu.job import Job
 from filterlab.ops.cpu.quadric_hits import QuadricsVariant
-from filterlab.ops.cpu.tree_walk import RAYS_OF_A_CHUNK, WalkJob
-from filterlab.ops.quadrics import InLeaves, Quadrics, Rays
+from filterlab.ops.cpu.tree_walk import RAYS_OF_A_CHUNK, RowsJob
+from filterlab.ops.quadrics import InLeaves, Quadrics, Rays, in_parts
 
 RAYS_AT_ONCE = 1 << 18
 
@@ -34,9 +35,9 @@ def walked(
     given: InLeaves, variant: compiler.Variant, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
 ) -> tuple[Tensor, Tensor]:
     """`ops.reference.quadrics.walked`, by the program of that variant."""
-    parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-    t, piece = zip(*[_of_part(given, variant, o, d, sheets, farthest) for o, d in parts], strict=True)
-    return torch.cat(t), torch.cat(piece)
+    cast = lambda o, d: _of_part(given, variant, o, d, sheets, farthest)  # noqa: E731
+    t, piece = in_parts(cast, origins, directions, RAYS_AT_ONCE)
+    return t, piece
 
 
 def _of_part(
@@ -45,8 +46,21 @@ def _of_part(
     rays = Rays.of(given.tree, origins, directions, farthest)
     tau = rays.first.new_full((len(origins), sheets), torch.inf)
     place = torch.full_like(tau, -1, dtype=torch.int64)
-    job = WalkJob(rays=len(origins), sheets=sheets, next=0, chunks=-(-len(origins) // RAYS_OF_A_CHUNK))
-    job.point(boxes=given.tree.boxes, children=given.tree.children, leaves=given.leaves, tau=tau, place=place)
-    job.point(**{name: getattr(rays, name).contiguous() for name in ("start", "along", "first", "last")})
-    pool.run(compiler.compiled(variant), [job] * max(1, min(torch.get_num_threads(), job.chunks)))
+    job = job_of(RowsJob, given, rays, sheets=sheets)
+    job.point(tau=tau, place=place)
+    run(variant, job)
     return rays.t(tau), given.tree.numbers(place)
+
+
+def job_of(kind: type[Job], given: InLeaves, rays: Rays, **numbers: float) -> Job:
+    """Of a walk for every ray."""
+    chunks = -(-len(rays.first) // RAYS_OF_A_CHUNK)
+    job = kind(rays=len(rays.first), next=0, chunks=chunks, **numbers)
+    job.point(boxes=given.tree.boxes, children=given.tree.children, leaves=given.leaves)
+    job.point(**{name: getattr(rays, name).contiguous() for name in ("start", "along", "first", "last")})
+    return job
+
+
+def run(variant: compiler.Variant, job: Job) -> None:
+    """On as many threads as torch is set to."""
+    pool.run(compiler.compiled(variant), [job] * max(1, min(torch.get_num_threads(), job.chunks)))

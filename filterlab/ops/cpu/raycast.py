@@ -94,6 +94,7 @@ def _job(given: Raycast, coefficients: Tensor) -> RaycastJob:
         height=plane // row,
         scale=lattice.scale,
         shift=lattice.shift - given.level,
+        margin=given.margin,
         edge=given.edge.bit_length() - 1,
     )
     for axis, cells, bricks in zip(AXES, lattice.cells, given.marks.shape[::-1], strict=True):

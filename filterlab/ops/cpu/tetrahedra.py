@@ -14,7 +14,7 @@ from llvmlite import ir
 
 from filterlab.ops.cpu.lanes import I32, I64, Lanes, Storage, Value
 from filterlab.ops.cpu.taps import Grid, Lines, Location
-from filterlab.ops.tetrahedra import Block, Sum, TetrahedralStencil, Turned
+from filterlab.ops.tetrahedra import Block, Steps, Sum, TetrahedralStencil, Turned
 
 
 class CellLocation(Location):
@@ -99,11 +99,30 @@ class TetrahedralTaps:
         along = self.sum.along_cone(turned, strides)
         return Corners([self._moved(first, along, centre) for centre in spline.centres], same)
 
+    def around_sample(self, odd: Sequence[Value]) -> Corners:
+        """Around `Trend.centres`, from the coefficient of the first sample that a cube needs; masks along x, y, z."""
+        e, b, spline = self.lanes, self.builder, self.sum.spline
+        kind = ir.VectorType(I64, e.count)
+
+        def moved(centre: Steps) -> Value:
+            total = ir.Constant(kind, None)
+            for stride, mirrored, c in zip(self._strides(), odd, centre, strict=True):
+                steps = (ir.Constant(kind, [(side * c - 1) // 2] * e.count) for side in (1, -1))
+                ahead, behind = (b.mul(stride, step) for step in steps)  # the same of all rays: made before they are
+                total = b.add(total, b.select(mirrored, behind, ahead))
+            return total
+
+        same = self._diagonal(spline.around - spline.before)
+        return Corners([moved(centre) for centre in spline.trend.centres], same)
+
+    def _strides(self) -> list[Value]:
+        plane = self.builder.mul(self.grid.width, self.grid.height)
+        return [self.lanes.everywhere(n) for n in (I64(1), self.grid.width, plane)]
+
     def _signed_strides(self, turned: Turned) -> list[Value]:
         """Along x, y, z away from the centre."""
         e, b = self.lanes, self.builder
-        plane = b.mul(self.grid.width, self.grid.height)
-        strides = [e.everywhere(n) for n in (I64(1), self.grid.width, plane)]
+        strides = self._strides()
         none = ir.Constant(strides[0].type, None)
         return [e.where(negative, b.sub(none, s), s) for negative, s in zip(turned.negative, strides, strict=True)]
 

@@ -1,4 +1,4 @@
-"""Casting rays at splines of heights: what runs it. Derivatives of hits are `surfaces.base`'s, once for all surfaces."""
+"""Casting rays at splines of heights: what runs it. Derivatives of hits are `surfaces.base`'s, as of all surfaces."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from filterlab.ops import cpu
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.gather import STORAGE
-from filterlab.ops.height_hits import Cell, HeightHits, Pyramid
+from filterlab.ops.height_hits import Cell, HeightHits
 from filterlab.ops.heights import Heights
 from filterlab.ops.raycast import Candidates
 
@@ -54,9 +54,7 @@ def met(given: HeightHits, origins: Tensor, directions: Tensor, implementation: 
     return _driver(given, origins, implementation).met(given, origins, directions)
 
 
-def candidates(
-    given: HeightHits, origins: Tensor, directions: Tensor, implementation: str | None = None
-) -> Candidates:
+def candidates(given: HeightHits, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Candidates:
     """The pieces of rays (R, 3) that may hold a hit, those of a ray in order. Arguments as for `first`."""
     return _driver(given, origins, implementation).candidates(given, origins, directions)
 

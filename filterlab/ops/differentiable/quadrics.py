@@ -36,8 +36,12 @@ def hits(
 
     Args:
         sheets, farthest: k hits in order, or from the last on; t is ∞, the number −1 where there are no more.
-        implementation: "reference" or "cpu"; None: the faster one that can run.
+        implementation: "reference", "cpu" or "cuda"; None: the fastest that can run.
     """
-    if implementation is None:
-        implementation = "cpu" if missing(given, origins) is None else "reference"
-    return driver(implementation, given.op).hits(given, origins, directions, sheets, farthest)
+    driven = driver(implementation or implementation_for(given, origins), given.op)
+    return driven.hits(given, origins, directions, sheets, farthest)
+
+
+def implementation_for(given: InLeaves, origins: Tensor) -> str:
+    """What casts these rays unasked: "cpu" on the CPU, else plain torch. "cuda" has only run in the interpreter yet."""
+    return "cpu" if missing(given, origins) is None else "reference"

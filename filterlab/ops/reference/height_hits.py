@@ -103,17 +103,24 @@ def _candidates_of_part(given: HeightHits, origins: Tensor, directions: Tensor, 
         keep = found.holds
         line = found.line[:, None].expand_as(keep)[keep]
         length = own.length[line]
-        near, far = (length * x[keep] for x in (found.near, found.far))
+        start, near, far = (length * x for x in (own.start[line], found.near[keep], found.far[keep]))
         none = torch.zeros_like(line, dtype=torch.bool)
-        rows = own.ray[line] + before, length * own.start[line], near, far
-        parts.append(Candidates(*rows, found.coefficients[keep], none, found.repeated[keep]))
+        ray, coefficients, repeated = own.ray[line] + before, found.coefficients[keep], found.repeated[keep]
+        parts.append(Candidates(ray, start, near, far, coefficients, none, repeated))
         return torch.zeros_like(found.line, dtype=torch.bool)
 
     walk(given, own.lines, take)
-    none = Candidates(own.ray[:0], *(own.start[:0],) * 3, own.start.new_zeros(0, DEGREE + 1), *(own.ray[:0] > 0,) * 2)
-    every = joined([none, *parts])
+    if not parts:
+        return _no_candidates(origins)
+    every = joined(parts)
     order = every.ray.argsort(stable=True)  # of every ray pieces came in order
     return Candidates(*(column[order] for column in every))
+
+
+def _no_candidates(rays: Tensor) -> Candidates:
+    whole, number = (rays.new_zeros(0, dtype=dtype) for dtype in (torch.int64, torch.float64))
+    none = whole > 0
+    return Candidates(whole, number, number, number, number.new_zeros(0, DEGREE + 1), none, none)
 
 
 # --- the way ----------------------------------------------------------------------------------------------------------
@@ -183,12 +190,16 @@ def walk(given: HeightHits, lines: Lines, take: Callable[[Pieces], Tensor]) -> N
 
 
 def _begin(given: HeightHits, lines: Lines) -> _Places:
-    x, y = (
-        lines.origins[:, axis].floor().long().clamp(0, given.heights.cells[axis] - 1) for axis in range(2)
-    )
+    x, y = (lines.origins[:, axis].floor().long().clamp(0, given.heights.cells[axis] - 1) for axis in range(2))
     nothing = torch.zeros_like(lines.near)
     return _Places(
-        torch.arange(len(x), device=x.device), x, y, torch.full_like(x, given.pyramid.top), nothing, nothing - 1, nothing
+        torch.arange(len(x), device=x.device),
+        x,
+        y,
+        torch.full_like(x, given.pyramid.top),
+        nothing,
+        nothing - 1,
+        nothing,
     )
 
 
@@ -239,9 +250,7 @@ def _advanced(given: HeightHits, lines: Lines, at: _Places, out: Tensor, along_y
 # --- cells ------------------------------------------------------------------------------------------------------------
 
 
-def _in_cells(
-    given: HeightHits, lines: Lines, at: _Places, out: Tensor, here: Tensor
-) -> tuple[Pieces, _Places]:
+def _in_cells(given: HeightHits, lines: Lines, at: _Places, out: Tensor, here: Tensor) -> tuple[Pieces, _Places]:
     """Both pieces of the lines under a mask, and all places, which know how these ended."""
     own, far = at.chosen(here), out[here]
     lines = lines.chosen(here.nonzero()[:, 0])

@@ -14,12 +14,8 @@ import torch
 from torch import Tensor
 
 from filterlab import bernstein
-from filterlab.ops.heights import Heights, Pattern, Triangle
+from filterlab.ops.heights import Heights, Pattern, Triangle, differences, rows
 from filterlab.volume import Boundary
-
-DEGREE = 4
-ROWS = (1, 3, 6)
-"""Of a jet of order 0, 1, 2: z; z_x, z_y; z_xx, z_xy, z_yy."""
 
 AT_ONCE = 1 << 13
 """Points whose data are read together: (K, P) numbers stay in cache."""
@@ -44,7 +40,7 @@ def _of_triangle(heights: Heights, cells: Tensor, triangle: Triangle, dtype: tor
 
 
 def jet(heights: Heights, points: Tensor, order: int) -> Tensor:
-    """Rows (N, R, P) of a jet of an order, 0 to 2, at world points (N, P, 2), in their type.
+    """The rows (N, R, P) of `ops.heights.rows` at world points (N, P, 2), in their type; order 0 to 4.
 
     NaN where a coordinate is not finite, and in holes. Differentiable twice in heights and points, by autograd.
     """
@@ -54,7 +50,7 @@ def jet(heights: Heights, points: Tensor, order: int) -> Tensor:
         chunk = points.reshape(n * m, 2)[begin : begin + AT_ONCE]
         entry = torch.arange(begin, begin + len(chunk), device=points.device) // max(m, 1) if n > 1 else 0
         parts.append(_rows(heights, chunk, entry, order))
-    return torch.cat(parts, -1).reshape(ROWS[order], n, m).movedim(0, 1)
+    return torch.cat(parts, -1).reshape(len(rows(order)), n, m).movedim(0, 1)
 
 
 def _rows(heights: Heights, points: Tensor, entry: Tensor | int, order: int) -> Tensor:
@@ -66,8 +62,8 @@ def _rows(heights: Heights, points: Tensor, entry: Tensor | int, order: int) -> 
     data = torch.where(unknown, 0, data)
     base = torch.where(at.up, data[pattern.up.first], data[pattern.down.first])
     coefficients = _coefficients(pattern, data - base, at.up)
-    rows = _derivatives(coefficients.T, at.barycentric, order)
-    scaled = torch.stack(rows) * at.factors(heights, order)
+    derivatives = _derivatives(coefficients.T, at.barycentric, order)
+    scaled = torch.stack(derivatives) * at.factors(heights, order)
     scaled = torch.cat((scaled[:1] + base, scaled[1:]))
     return torch.where(unknown, torch.nan, scaled)
 
@@ -146,32 +142,16 @@ class Located:
         turned = torch.where(self.up, 1.0, -1.0).to(self.barycentric)
         x, y = (turned / (heights.pattern.steps * d) for d in heights.spacing)
         x = -x if heights.pattern.mirrored else x
-        rows = (torch.ones_like(x),) if order == 0 else (torch.ones_like(x), x, y)
-        return torch.stack(rows if order < 2 else (*rows, x * x, x * y, y * y))
+        return torch.stack([x**i * y**j for i, j in rows(order)])
 
 
 def _derivatives(coefficients: Tensor, barycentric: Tensor, order: int) -> list[Tensor]:
     """R rows (P,) along λ1 and λ2, of coefficients (P, 15), by de Casteljau's algorithm."""
-    rows: list[Tensor] = []
+    found: list[Tensor] = []
     for own in range(order, -1, -1):
         steps = bernstein.degree_of(coefficients, 2) - own
         coefficients = bernstein.blossom(coefficients, [barycentric] * steps)
-        rows = [*_differences(coefficients, own), *rows]
-    return rows
-
-
-def _differences(coefficients: Tensor, order: int) -> tuple[Tensor, ...]:
-    """All derivatives of an order, of what is left of degree 4 after 4 − order steps."""
-    c = coefficients.unbind(-1)
-    match order:
-        case 0:
-            return c
-        case 1:
-            return DEGREE * (c[1] - c[0]), DEGREE * (c[2] - c[0])
-        case _:
-            twice = DEGREE * (DEGREE - 1)
-            return (
-                twice * (c[3] - 2 * c[1] + c[0]),
-                twice * (c[4] - c[1] - c[2] + c[0]),
-                twice * (c[5] - 2 * c[2] + c[0]),
-            )
+        left = coefficients.unbind(-1)
+        sums = [[w * left[k] for k, w in differences(i, j).items()] for i, j in rows(own) if i + j == own]
+        found = [*(sum(terms[1:], terms[0]) for terms in sums), *found]
+    return found

@@ -18,7 +18,7 @@ top, and those behind a ray's last hit are dropped: memory does not grow with th
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -37,6 +37,7 @@ from filterlab.ops.quadrics import (
     Kept,
     Quadrics,
     Rays,
+    in_parts,
 )
 
 PAIRS_AT_ONCE = 1 << 14  # of rays and nodes, or leaves
@@ -61,10 +62,9 @@ def walked(
     given: InLeaves, meets: Meets, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
 ) -> tuple[Tensor, Tensor]:
     """The same of whatever is in the leaves of a tree, and meets rays as that function says."""
-    parts = zip(origins.split(_RAYS_AT_ONCE), directions.split(_RAYS_AT_ONCE), strict=True)
-    found = [_of_part(given, meets, o, d, sheets, farthest) for o, d in parts]
-    t, piece = zip(*found, strict=True)
-    return torch.cat(t), torch.cat(piece)
+    cast = lambda o, d: _of_part(given, meets, o, d, sheets, farthest)  # noqa: E731
+    t, piece = in_parts(cast, origins, directions, _RAYS_AT_ONCE)
+    return t, piece
 
 
 def _of_part(
@@ -72,10 +72,29 @@ def _of_part(
 ) -> tuple[Tensor, Tensor]:
     rays = Rays.of(given.tree, origins, directions, farthest)
     table = _Table.of_rays(rays, sheets)
+    walk(given, meets, rays, table)
+    return rays.t(table.tau), given.tree.numbers(table.place)
+
+
+class Taking(Protocol):
+    """Who is told of hits on a walk."""
+
+    @property
+    def limit(self) -> Tensor:
+        """τ (R,): hits behind it need not be told."""
+        ...
+
+    def take(self, ray: Tensor, tau: Tensor, place: Tensor) -> None:
+        """Hits (M,) in no order: numbers of rays, τ, and places of what is hit."""
+        ...
+
+
+def walk(given: InLeaves, meets: Meets, rays: Rays, found: Taking) -> None:
+    """Tells of every hit before its limit, the nearest leaves first, more or less."""
     stack = _Pairs.at_root(rays).split()
     while stack:
         pairs = stack.pop()
-        pairs = pairs.some(pairs.near <= table.tau[pairs.ray, -1])
+        pairs = pairs.some(pairs.near <= found.limit[pairs.ray])
         if not len(pairs.ray):
             continue
         inner = pairs.some(pairs.node >= 0)
@@ -83,8 +102,7 @@ def _of_part(
             stack += _below(given, rays, inner).split()
         leaves = pairs.some(pairs.node < 0)
         if len(leaves.ray):
-            table.take(*_in_leaves(given, meets, rays, leaves.ray, -1 - leaves.node))
-    return rays.t(table.tau), given.tree.numbers(table.place)
+            found.take(*_in_leaves(given, meets, rays, leaves.ray, -1 - leaves.node))
 
 
 class _Pairs(NamedTuple):
@@ -223,8 +241,11 @@ class _Table:
         tau = rays.first.new_full((len(rays.first), sheets), torch.inf)
         return cls(tau, torch.full_like(tau, -1, dtype=torch.int64))
 
+    @property
+    def limit(self) -> Tensor:
+        return self.tau[:, -1]
+
     def take(self, ray: Tensor, tau: Tensor, place: Tensor) -> None:
-        """Hits (M,) in no order."""
         rows = ray.unique()
         ray = torch.cat((rows.repeat_interleave(self.tau.shape[1]), ray))
         tau, place = torch.cat((self.tau[rows].flatten(), tau)), torch.cat((self.place[rows].flatten(), place))
