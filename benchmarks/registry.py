@@ -18,6 +18,8 @@ _NAMES = (
     "roots",
     "dvr",
     "surfaces",
+    "terrain",
+    "slim",
     "absent",
     "scaling",
     "steadiness",

@@ -7,6 +7,7 @@ with those of hits alone.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Literal, NamedTuple
@@ -17,7 +18,7 @@ from torch import Tensor
 
 import filterlab as fl
 from experiments.config import BoundaryName, Dtype, ExperimentConfig, Recipe, number, torch_dtype
-from experiments.descent import Parameters, Stage, minimize
+from experiments.descent import Parameters, Stage, State, minimize
 from experiments.inverse_dvr import files
 from experiments.recovery import directions
 from experiments.runs import Record, Run, Unit
@@ -25,7 +26,7 @@ from filterlab.fields.base import Domain
 from filterlab.io.config import StrictModel
 from filterlab.render import Camera, Light, PerspectiveCamera, Phong, Silhouettes, raycast
 from filterlab.scenes.model import Positive
-from filterlab.surfaces import LevelSet
+from filterlab.surfaces import LevelSet, Surface
 
 WITH, WITHOUT = "with", "without"
 _LIGHTS = (Light((-0.6, -0.5, 1.0)), Light(None, (0.3, 0.3, 0.3)))
@@ -66,6 +67,12 @@ class Views(StrictModel):
         apart = {int((k + 0.5) * together / self.held_out) for k in range(self.held_out)}
         listed = [_camera(domain, d) for d in directions(together)]
         return [c for i, c in enumerate(listed) if i not in apart], [listed[i] for i in sorted(apart)]
+
+    def of_step(self, iteration: int, seed: int) -> list[int]:
+        """Those that a step looks at: along a permutation, drawn anew when all have been seen."""
+        first = iteration * self.at_once
+        places = range(first, first + self.at_once)
+        return [int(_permutation(self.training, seed, k // self.training)[k % self.training]) for k in places]
 
 
 def _camera(domain: Domain, direction: tuple[float, float, float]) -> Camera:
@@ -169,17 +176,11 @@ class SurfaceProblem:
         raise AssertionError("there is one stage")
 
     def loss(self, parameters: Parameters, stage: int, iteration: int) -> tuple[Tensor, Tensor]:
-        voxels, views = parameters["voxels"], self._views(iteration)
+        voxels, views = parameters["voxels"], self.config.views.of_step(iteration, self.config.seed)
         cameras = [self.training[k] for k in views]
         images = _images(self.config, _field(voxels, self.config), cameras, self.silhouettes, iteration)
         penalty = self.config.smoothness * bending(voxels)
         return misfit(self.weights, images, Images(*(x[views] for x in self.wanted))), penalty
-
-    def _views(self, iteration: int) -> list[int]:
-        """Those that a step looks at: along a permutation, drawn anew when all have been seen."""
-        count, first = self.config.views.training, iteration * self.config.views.at_once
-        places = range(first, first + self.config.views.at_once)
-        return [int(_permutation(count, self.config.seed, k // count)[k % count]) for k in places]
 
     def project(self, parameters: Parameters) -> None:
         """Nothing: every number is allowed."""
@@ -213,24 +214,18 @@ def _field(voxels: Tensor, config: Config) -> fl.Field:
 def _images(
     config: Config, field: fl.Field, cameras: list[Camera], silhouettes: Silhouettes | None = None, seed: int = 0
 ) -> Images:
-    size, surface = config.views.size, LevelSet(field, config.level)
-    listed = [
-        _channels(
-            surface,
-            camera,
-            size=(size, size),
-            silhouettes=silhouettes,
-            seed=seed,
-            dtype=torch_dtype(config.dtype),
-            device=config.device,
-        )
-        for camera in cameras
-    ]
+    options = {"silhouettes": silhouettes, "seed": seed, "dtype": torch_dtype(config.dtype), "device": config.device}
+    return images_of(LevelSet(field, config.level), cameras, config.views.size, **options)
+
+
+def images_of(surface: Surface, cameras: list[Camera], size: int, **options: Any) -> Images:
+    """Of square views."""
+    listed = [_channels(surface, camera, size=(size, size), **options) for camera in cameras]
     color, depth, normal = (torch.stack([image[name] for image in listed]) for name in ("color", "depth", "normal"))
     return Images(color[..., 3], depth[..., 0], normal)
 
 
-def _channels(surface: LevelSet, camera: Camera, **options: Any) -> dict[str, Tensor]:
+def _channels(surface: Surface, camera: Camera, **options: Any) -> dict[str, Tensor]:
     images = raycast(surface, camera, channels=("color", "depth", "normal"), **options)
     assert isinstance(images, dict)
     return images
@@ -280,28 +275,36 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
         "start": _field(problem.start()["voxels"], config),
         "result": _field(found, config),
     }
-    images = _shown(config, {"training": problem.training[0], "held_out": problem.held_out[0]}, shown, unit.key, run)
+    surfaces = {name: LevelSet(field, config.level) for name, field in shown.items()}
+    cameras = {"training": problem.training[0], "held_out": problem.held_out[0]}
+    images = save_views(surfaces, cameras, config.views.shown, unit.key, run, device=config.device)
     array = run.save_array(unit.key, found)
-    ends = [observation["iteration"] for observation in state.observations]
-    means = [None, *(sum(state.misfits[a:b]) / (b - a) for a, b in pairwise(ends))]
     return {
         "kind": kind,
         "compared": name,
-        "misfits": state.misfits,
-        "penalties": state.penalties,
-        "observations": [{**o, "misfit": m} for o, m in zip(state.observations, means, strict=True)],
+        **course(state),
         "images": images,
         "voxels": array,
         "files": [*files(images), array],
     }
 
 
+def course(state: State) -> Record:
+    """How a descent went; observations with the mean misfit of the steps since the one before."""
+    ends = [observation["iteration"] for observation in state.observations]
+    means = [None, *(sum(state.misfits[a:b]) / (b - a) for a, b in pairwise(ends))]
+    observations = [{**o, "misfit": m} for o, m in zip(state.observations, means, strict=True)]
+    return {"misfits": state.misfits, "penalties": state.penalties, "observations": observations}
+
+
 @torch.no_grad()
-def _shown(config: Config, cameras: dict[str, Camera], fields: dict[str, fl.Field], key: str, run: Run) -> Record:
-    """Shaded images and normals of some views, and where the result differs from the target."""
+def save_views(
+    surfaces: Mapping[str, Surface], cameras: dict[str, Camera], size: int, key: str, run: Run, **options: Any
+) -> Record:
+    """Shaded images and normals of some views, and where all others differ from the target."""
     saved: Record = {}
     for view, camera in cameras.items():
-        seen = {name: _picture(config, field, camera) for name, field in fields.items()}
+        seen = {name: _picture(surface, camera, size, **options) for name, surface in surfaces.items()}
         saved[view] = {}
         for name, (color, normal, depth) in seen.items():
             saved[view][name] = run.save_image(f"{key}-{view}-{name}", color)
@@ -312,10 +315,9 @@ def _shown(config: Config, cameras: dict[str, Camera], fields: dict[str, fl.Fiel
     return saved
 
 
-def _picture(config: Config, field: fl.Field, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+def _picture(surface: Surface, camera: Camera, size: int, **options: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Shaded (S, S, 3), the normal as ½ + ½ n, black where nothing is hit, and depth (S, S); float32, on the CPU."""
-    size, surface = (config.views.shown,) * 2, LevelSet(field, config.level)
-    given: dict[str, Any] = {"size": size, "lights": _LIGHTS, "device": config.device}
+    given: dict[str, Any] = {"size": (size, size), "lights": _LIGHTS, **options}
     color = raycast(surface, camera, Phong((0.85, 0.72, 0.55)), subpixels=2, background=(0.05, 0.06, 0.08), **given)
     assert isinstance(color, Tensor)
     at = _channels(surface, camera, **given)

@@ -1,5 +1,7 @@
 from . import costs, io, kernels, metrics, nn, prefilters, render, signals, spectrum
 from .fields.base import Field
+from .heights import Heights
+from .io.heights import load_heights, save_heights
 from .io.volumes import load_volume, save_volume
 from .kernels import KERNELS
 from .methods import METHODS, Method, reconstruct
@@ -16,6 +18,7 @@ __all__ = [
     "PREFILTERS",
     "Boundary",
     "Field",
+    "Heights",
     "Method",
     "Recommendation",
     "Volume",
@@ -24,6 +27,7 @@ __all__ = [
     "from_zyx",
     "io",
     "kernels",
+    "load_heights",
     "load_volume",
     "metrics",
     "nn",
@@ -32,6 +36,7 @@ __all__ = [
     "reconstruct",
     "render",
     "resample",
+    "save_heights",
     "save_volume",
     "signals",
     "spectrum",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeVar, overload
 
 import numpy as np
@@ -36,3 +37,19 @@ def as_tensor(x: object) -> object:
     native = x.astype(x.dtype.newbyteorder("="), copy=False)
     strided = all(s >= 0 and s % x.itemsize == 0 for s in native.strides)
     return torch.from_numpy(np.asarray(native) if strided and native.flags.writeable else native.copy())
+
+
+def as_numbers(
+    x: Array | Sequence[float] | Sequence[Sequence[float]] | float,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """Numbers, however they are given, as a tensor of a type; differentiable in a tensor.
+
+    Args:
+        device: where they are to be; None: where a tensor is, else on the CPU.
+
+    Raises:
+        TypeError, ValueError, OverflowError or RuntimeError, as torch does, for what are no numbers.
+    """
+    return torch.as_tensor(as_tensor(x), dtype=dtype, device=device)

@@ -150,6 +150,13 @@ class Kernel(PiecewisePolynomial):
     def _float64_table(self) -> Tensor:
         return torch.tensor([[float(c) for c in p] for p in self.pieces], dtype=torch.float64)
 
+    @cached_property
+    def sum_over_translates(self) -> Fraction | None:
+        """Σ_k φ(x − k) where it is the same at every x: what samples that are all 1 give; None: it depends on x."""
+        if self.approximation_order < 1:
+            return None
+        return sum((piece[0] for piece in self.pieces), Fraction(0))
+
     @property
     def start(self) -> Fraction:
         """−S/2, where the first piece begins."""

@@ -155,11 +155,13 @@ class Asked:
     storage: str | torch.dtype | None = None
 
     def coefficients(
-        self, prefilter: Prefilter, reach: int, storage: torch.dtype | None, factor: kernels.Factor | None = None
+        self, prefilter: Prefilter, scheme: Scheme, storage: torch.dtype | None, factor: kernels.Factor | None = None
     ) -> Coefficients:
-        """The samples, filtered if that is asked, padded and stored; see `Coefficients.of`."""
-        chosen = prefilter if self.prefilter else prefilters.IDENTITY
-        return Coefficients.of(self.samples, chosen, self.boundary, reach, factor, storage, self.unknown)
+        """The samples, filtered if that is asked, padded as a scheme needs and stored; see `Coefficients.of`."""
+        chosen, unknown = prefilter if self.prefilter else prefilters.IDENTITY, self.unknown
+        return Coefficients.of(
+            self.samples, chosen, self.boundary, scheme.reach, factor, storage, unknown, scheme.single
+        )
 
 
 @dataclass(frozen=True)
@@ -249,13 +251,15 @@ class TensorProduct(Method):
 
     def build(self, volume: Volume, asked: Asked) -> Field:
         scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
-        coefficients = asked.coefficients(self.prefilter, scheme.reach, _storage_for(self, asked.storage), self.factor)
+        if isinstance(scheme, Direct):
+            scheme = scheme.along(volume.size, asked.boundary)
+        coefficients = asked.coefficients(self.prefilter, scheme, _storage_for(self, asked.storage), self.factor)
         return GridField(self.name, volume, coefficients, _that_runs(scheme, coefficients, asked))
 
     def rebuilt(self, field: Field, asked: Asked) -> Field:
         assert isinstance(field, GridField)
         storage = _storage_for(self, asked.storage)
-        return field.with_coefficients(asked.coefficients(self.prefilter, field.scheme.reach, storage, self.factor))
+        return field.with_coefficients(asked.coefficients(self.prefilter, field.scheme, storage, self.factor))
 
 
 @dataclass(frozen=True)
@@ -307,13 +311,13 @@ class Tetrahedral(Method):
 
     def build(self, volume: Volume, asked: Asked) -> Field:
         scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
-        coefficients = asked.coefficients(self.prefilter, scheme.reach, named_storage(asked.storage))
+        coefficients = asked.coefficients(self.prefilter, scheme, named_storage(asked.storage))
         return FieldOnTetrahedra(self.name, volume, coefficients, _that_runs(scheme, coefficients, asked))
 
     def rebuilt(self, field: Field, asked: Asked) -> Field:
         assert isinstance(field, GridField)
         storage = named_storage(asked.storage)
-        return field.with_coefficients(asked.coefficients(self.prefilter, field.scheme.reach, storage))
+        return field.with_coefficients(asked.coefficients(self.prefilter, field.scheme, storage))
 
 
 _FORMER_SCHEMES = {"eight_trilinear": "sampled"}

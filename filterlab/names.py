@@ -19,6 +19,9 @@ BOUNDARIES = ("mirror", "reflect", "wrap", "border", "zeros")
 NanChoice = Literal["refuse", "propagate", "fill"]
 NAN_CHOICES: tuple[str, ...] = get_args(NanChoice)
 
+SPLINES = ("linear", "c0", "c1", "c2")
+"""Of heights: the keys of `filterlab.surfaces.quartic.SPLINES`."""
+
 TASKS = ("resample", "dvr", "isosurface")
 """What a method is recommended for."""
 

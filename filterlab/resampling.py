@@ -132,7 +132,7 @@ def resample(
         if dtype not in (None, volume.dtype):
             raise ValueError(f"nearest samples and labels keep their type, {volume.dtype}; got dtype={dtype}")
         samples = volume.samples if nan == "propagate" else resolved(volume.samples, nan)[0]
-        _check_fill(fill, volume.dtype)
+        check_fill(fill, str(volume.dtype).removeprefix("torch."))
         take = _labelled(samples, how, sites, progress) if labels else _nearest(samples, boundary, sites)
         return Volume.with_geometry(_made(take, samples, sites, volume.dtype, fill, progress), geometry)
     dtype = _type_of_result(volume.samples, dtype)
@@ -201,13 +201,13 @@ def _type_of_result(samples: Tensor, dtype: torch.dtype | None) -> torch.dtype:
     return dtype
 
 
-def _check_fill(fill: float | None, dtype: torch.dtype) -> None:
-    """Raises ValueError for a fill that the type of the result does not hold."""
-    if fill is None or dtype.is_floating_point:
+def check_fill(fill: float | None, dtype: str, name: str = "fill") -> None:
+    """Raises ValueError for a fill that no number of a type is: a name of NumPy's or torch's."""
+    if fill is None or "float" in dtype:
         return
-    info = torch.iinfo(dtype)
-    if fill != fill or fill in (math.inf, -math.inf) or fill != int(fill) or not info.min <= fill <= info.max:
-        raise ValueError(f"expected a fill that {dtype} holds; got {fill!r}")
+    info = np.iinfo(dtype)
+    if not (math.isfinite(fill) and fill == int(fill) and info.min <= fill <= info.max):
+        raise ValueError(f"expected a {name} that {dtype} holds; got {fill:g}")
 
 
 def _target(

@@ -22,7 +22,7 @@ UNIT = r"[!#-~]{1,20}"  # of printable characters, without spaces and quotes
 
 @dataclass(frozen=True)
 class NiftiForms:
-    """How a NIfTI file says where its grid lies.
+    """How a NIfTI file says where its grid lies, and what its numbers are.
 
     Attributes:
         version: 1 or 2.
@@ -30,6 +30,9 @@ class NiftiForms:
         time: the unit of time, as nibabel calls it.
         to_qform: where the two forms tell different places: the affine from the world of the sform, which is the
             volume's, to that of the qform, in rows; else None.
+        description: in Latin-1.
+        intent: what the numbers mean, a code of the format; 0: not told. 1002: they are labels.
+        intent_parameters, intent_name: what belongs to it.
     """
 
     version: int = 1
@@ -37,6 +40,10 @@ class NiftiForms:
     qform: int = 0
     time: str = "unknown"
     to_qform: tuple[tuple[float, ...], ...] | None = None
+    description: str = ""
+    intent: int = 0
+    intent_parameters: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    intent_name: str = ""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ FLOORS = {
     "arrays": -1,
     "geometry": -1,
     "forking": 0,
+    "heights": 0,
     "volume": 0,
     "kernels": 0,
     "bernstein": 0,
@@ -147,7 +148,7 @@ def test_a_circle_is_found(tmp_path):
 
 def test_every_op_has_its_parts():
     """A description, a plain twin, vector code, and what makes it differentiable; on a GPU as far as there is one."""
-    for op in ("gather", "place", "prefilter", "march", "raycast", "quadrics"):
+    for op in ("gather", "place", "prefilter", "march", "raycast", "quadrics", "slim"):
         for room in ("", "reference", "cpu", "differentiable"):
             assert (PACKAGE / "ops" / room / f"{op}.py").is_file(), f"{op} has no {room or 'description'}"
 
@@ -168,6 +169,7 @@ def test_the_floors_say_what_the_drawing_says():
 ORACLES = (
     *("oracles.py", "laws.py", "ray_oracle.py", "tetrahedral_oracle.py", "tetrahedral_ray_oracle.py"),
     "quadric_oracle.py",
+    "slim_oracle.py",
 )
 
 
@@ -189,6 +191,7 @@ PUBLIC = {
     "PREFILTERS",
     "Boundary",
     "Field",
+    "Heights",
     "Method",
     "Recommendation",
     "Volume",
@@ -197,6 +200,7 @@ PUBLIC = {
     "from_zyx",
     "io",
     "kernels",
+    "load_heights",
     "load_volume",
     "metrics",
     "nn",
@@ -205,6 +209,7 @@ PUBLIC = {
     "reconstruct",
     "render",
     "resample",
+    "save_heights",
     "save_volume",
     "signals",
     "spectrum",

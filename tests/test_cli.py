@@ -117,7 +117,40 @@ import sys
 from filterlab.cli import main
 codes = [main(asked) for asked in {asked!r}]
 assert codes == [0, 0, 2, 1, 1, 0, 1], codes
-assert "torch" not in sys.modules
+slow = {{"torch", "pydantic", "yaml", "typeguard", "scipy", "skimage", "matplotlib", "tifffile", "nibabel"}}
+assert not slow & set(sys.modules), slow & set(sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_showing_a_volume_reads_and_samples_it_once(volume_file: Path, tmp_path: Path, monkeypatch) -> None:
+    from filterlab.render import suggestion
+    from filterlab.scenes.model import sources
+
+    done = []
+
+    def counted(name: str, function):
+        return lambda *args, **options: done.append(name) or function(*args, **options)
+
+    monkeypatch.setattr(sources, "load_volume", counted("read", sources.load_volume))
+    monkeypatch.setattr(suggestion, "tables", counted("tables", suggestion.tables))
+    monkeypatch.setattr("filterlab.scenes.default.sampled", counted("sampled", suggestion.sampled))
+    monkeypatch.setattr(suggestion, "sampled", counted("sampled", suggestion.sampled))
+    assert main(["render", str(volume_file), "-o", str(tmp_path / "o.png"), "--size", "8", "8", "-q"]) == 0
+    assert sorted(done) == ["read", "sampled", "tables"]
+
+
+def test_what_resamples_and_renders_imports_no_library_that_it_does_not_use(volume_file: Path, tmp_path: Path) -> None:
+    resample = ["resample", str(volume_file), "-o", str(tmp_path / "o.nrrd"), "--shape", "3", "3", "3"]
+    render = ["render", str(volume_file), "-o", str(tmp_path / "o.png"), "--size", "8", "8"]
+    code = f"""
+import sys
+from filterlab.cli import main
+assert main({resample!r}) == 0
+assert not {{"pydantic", "yaml", "typeguard", "PIL"}} & set(sys.modules)
+assert main({render!r}) == 0
+assert not {{"typeguard", "scipy", "skimage", "kornia", "matplotlib", "tifffile"}} & set(sys.modules)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

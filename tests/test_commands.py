@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -17,6 +18,7 @@ from filterlab import METHODS, Volume, load_volume, resample, save_volume, signa
 from filterlab.cli import main
 from filterlab.cli.terminal import progress_bar
 from filterlab.world import World
+from tests.test_fitting import sphere
 
 GRID = r"5 × 4 × 3 voxels of 1 × 2 × 3 mm, float32"
 WRITERS: dict[str, tuple[str, list[str], str]] = {
@@ -29,6 +31,7 @@ WRITERS: dict[str, tuple[str, list[str], str]] = {
     ),
     "mesh": ("out.ply", ["{in}", "--level", "50"], r"\d+ triangles, \d+ vertices"),
     "render": ("out.png", ["{in}", "--level", "50", "--size", "8", "6"], "8 × 6 pixels, 8-bit RGB"),
+    "slim": ("out.npz", ["{xyz}", "--tolerance", "0.01"], r"\d+ balls of 300 points, rms [\d.e-]+, worst [\d.e-]+"),
     "recommend": ("out.yaml", ["{in}", "--max-error", "90%"], "a scene"),
 }
 """Command -> what it writes, its arguments, and what is said of the output."""
@@ -42,7 +45,8 @@ def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[
     path, ply = tmp_path / "in.nii", tmp_path / "in.ply"
     save_volume(Volume(samples, spacing=(1, 2, 3), world=World(unit="mm")), path)
     assert main(["mesh", str(path), "--level", "50", "-q", "-o", str(ply)]) == 0
-    given = {"{in}": str(path), "{ply}": str(ply)}
+    np.savetxt(xyz := tmp_path / "in.xyz", sphere(300))
+    given = {"{in}": str(path), "{ply}": str(ply), "{xyz}": str(xyz)}
 
     def made(command: str, *more: str) -> list[str]:
         output, arguments, _ = WRITERS[command]
@@ -189,6 +193,7 @@ EXPECTED = {
     "convert": {"reading", "writing"},
     "sdf": {"measuring", "writing"},
     "mesh": {"reading", "meshing"},
+    "slim": {"fitting"},
     "render": {"reading", "rendering"},
     "recommend": {"reading", "errors", "costs"},
     "info": {"reading", "counting"},

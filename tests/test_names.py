@@ -4,11 +4,13 @@ import subprocess
 import sys
 
 from filterlab import METHODS, Boundary, names
+from filterlab.surfaces.quartic import SPLINES
 
 
 def test_names_are_those_of_the_registries():
     assert tuple(METHODS) == names.METHODS == names.methods()
     assert tuple(Boundary) == names.BOUNDARIES
+    assert tuple(SPLINES) == names.SPLINES
 
 
 def test_methods_that_a_program_registers_are_known(monkeypatch):

@@ -314,7 +314,7 @@ def test_culling_loses_nothing_and_most_of_what_faces_away(kind, faces):
     corners = centers[:, None] + 0.3 * torch.randn(600, 4, 3, dtype=F64, generator=rng)
     surface = graphs(Spheres(centers, 0.5) if kind == "spheres" else Tetrahedra(corners), 7, faces)
     eye = numbers([3.0, -14.0, 8.0])[0]
-    kept = surface._facing(eye)
+    kept = surface.facing(eye)
     aim = surface.bounds.centers.repeat(8, 1) + 0.2 * torch.randn(4800, 3, dtype=F64, generator=rng)
     whole, part = (s.hit(eye, aim - eye) for s in (surface, surface.seen_from(eye)))
     assert torch.equal(whole.t, part.t)

@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import torch
 
 import filterlab as fl
@@ -18,6 +19,9 @@ def blocks(language: str) -> list[str]:
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     fl.save_volume(fl.Volume((255 * torch.rand(8, 9, 10)).to(torch.uint8)), "engine.nrrd")
+    fl.save_heights(
+        fl.Heights(300 + 90 * np.random.default_rng(1).random((8, 9), np.float32), (30.0, -30.0)), "dem.tif"
+    )
     names = {"points": torch.rand(5, 3) * 7, "matrix": torch.eye(4)}
     code = "\n".join(blocks("python")).replace("(512, 512)", "(16, 16)")
     exec(compile(code, str(README), "exec"), names)

@@ -194,6 +194,43 @@ def test_what_is_between_is_said_to_be_undecided() -> None:
     assert "the samples do not tell" in report.sentences(answer)[1]
 
 
+@pytest.mark.parametrize("task", ["resample", "dvr"])
+def test_what_a_refusal_says_would_help_does(task: str) -> None:
+    """The budget that is named is met."""
+    noise = torch.rand(24, 24, 24, generator=torch.Generator().manual_seed(1))
+    asked = {"task": task, "methods": ["triquadratic", "tricubic"], **FAST}
+    refused = recommend(noise, 0.01, **asked)
+    *_, best, helps = report.sentences(refused)
+    assert refused.pick is None
+    assert helps.startswith("What would help: a budget of ")
+    assert "antialias=True" in helps
+    assert not refused.best.resolved
+    budget = float(helps.split("a budget of ")[1].split(" %")[0]) / 100
+    assert refused.best.error.high <= budget <= 1.01 * refused.best.error.high
+    met = recommend(noise, budget, **asked)
+    assert met.pick is not None
+    assert f"The most accurate: {refused.best.method}" in best
+    assert all("help" not in line for line in report.sentences(met))
+
+
+def test_a_refusal_says_where_the_value_alone_would_do(samples) -> None:
+    every = recommend(samples, 1e-9, task="isosurface", methods=["tricubic"], **FAST)
+    between = math.sqrt(every.of_value.high * every.best.error.high)
+    assert every.of_value.high < between < every.best.error.high
+    refused = recommend(samples, between, task="isosurface", methods=["tricubic"], **FAST)
+    assert refused.pick is None
+    assert "to count the value alone, as task resample does" in report.sentences(refused)[-1]
+    assert recommend(samples, between, methods=["tricubic"], **FAST).pick is not None
+    assert "the value alone" not in report.sentences(every)[-1]
+    assert "finer voxels" in report.sentences(every)[-1]
+
+
+def test_a_refusal_for_memory_alone_names_what_is_needed(samples) -> None:
+    refused = recommend(samples, 0.5, max_memory=10, methods=["tricubic"], **FAST)
+    assert refused.pick is None
+    assert all("help" not in line for line in report.sentences(refused))
+
+
 # --- what is recommended can be built ---------------------------------------------------------------------------------
 
 

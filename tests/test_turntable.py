@@ -81,7 +81,7 @@ def test_frames_are_numbered_pictures_of_one_field(
     scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     built = []
-    monkeypatch.setattr(building, "build", lambda scene: built.append(1) or build(scene))
+    monkeypatch.setattr(building, "build", lambda *asked: built.append(1) or build(*asked))
     (tmp_path / "frames").mkdir()  # one that is empty may be there
     assert main(["render", str(scene_file), "--turntable", "3", "-o", str(tmp_path / "frames")]) == 0
     assert built == [1]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from experiments.report import plots
-from experiments.report.page import Column, Gallery, Plot, Section, Table, picture
+from experiments.report.page import Column, Gallery, Picture, Plot, Section, Table, picture
 from experiments.report.style import OTHERS, fixed, text
 from experiments.runs import Record
 
@@ -22,12 +22,19 @@ PANELS = (
     ("normal_angle", "Normal, held out: mean angle / °"),
 )
 
+CAPTION = (
+    "Two rows for each recovery. Normals as ½ + ½ n. Errors: grey, differences of depth where both hit, white from 0.1 "
+    "world units on; red, hit where the target is not; blue, missed where it is."
+)
+
 
 def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section:
     """The section of the report."""
     listed = list(records.values())
     parts = [Section(title, (), [_view(listed, view, folder)]) for view, title in VIEWS.items()]
-    parts.append(Section("Convergence", (), [_convergence(listed), _numbers(listed)]))
+    names = list(dict.fromkeys(r["compared"] for r in listed))
+    drawn = convergence(listed, lambda r: _look(r, names), PANELS, "inverse-surface")
+    parts.append(Section("Convergence", (), [drawn, _numbers(listed)]))
     return Section("From depths, normals and silhouettes back to a volume", _lead(config), (), parts)
 
 
@@ -60,31 +67,33 @@ def _look(record: Record, names: Sequence[str]) -> dict:
 def _view(records: Sequence[Record], view: str, folder: Path) -> Gallery:
     pictures = []
     for r in records:
-        images = r["images"][view]
-        pictures += [
-            picture(folder, images["target"], "target"),
-            picture(folder, images["start"], "start"),
-            picture(folder, images["result"], "result", _name(r)),
-            picture(folder, images["start_error"], "error of the start"),
-            picture(folder, images["target_normal"], "normals of the target"),
-            picture(folder, images["start_normal"], "normals of the start"),
-            picture(folder, images["result_normal"], "normals of the result", _name(r)),
-            picture(folder, images["result_error"], "error of the result", _name(r)),
-        ]
-    caption = (
-        "Two rows for each recovery. Normals as ½ + ½ n. Errors: grey, differences of depth where both hit, white from "
-        "0.1 world units on; red, hit where the target is not; blue, missed where it is."
-    )
-    return Gallery(pictures, caption, columns=4)
+        pictures += two_rows(r["images"][view], _name(r), folder)
+    return Gallery(pictures, CAPTION, columns=4)
 
 
-def _convergence(records: Sequence[Record]) -> Plot:
-    names = list(dict.fromkeys(r["compared"] for r in records))
+def two_rows(images: Record, name: str, folder: Path) -> list[Picture]:
+    """Four pictures of one view, twice: target, start, result, and errors."""
+    return [
+        picture(folder, images["target"], "target"),
+        picture(folder, images["start"], "start"),
+        picture(folder, images["result"], "result", name),
+        picture(folder, images["start_error"], "error of the start"),
+        picture(folder, images["target_normal"], "normals of the target"),
+        picture(folder, images["start_normal"], "normals of the start"),
+        picture(folder, images["result_normal"], "normals of the result", name),
+        picture(folder, images["result_error"], "error of the result", name),
+    ]
+
+
+def convergence(
+    records: Sequence[Record], look: Callable[[Record], dict], panels: Sequence[tuple[str, str]], name: str
+) -> Plot:
+    """Curves of what was observed, a panel for each quantity and title."""
     with plots.settings():
         figure = plots.canvas(10.4, 3.4)
-        for axes, (quantity, title) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
+        for axes, (quantity, title) in zip(figure.subplots(1, len(panels)), panels, strict=True):
             for r in records:
-                axes.plot(*zip(*_course(r, quantity), strict=True), **_look(r, names))
+                axes.plot(*zip(*_course(r, quantity), strict=True), **look(r))
             axes.set_title(title, fontsize=8)
             axes.set_xlabel("iteration")
             axes.set_xlim(left=0)
@@ -93,7 +102,7 @@ def _convergence(records: Sequence[Record]) -> Plot:
                 plots.logarithmic(axes)
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
-        drawn = plots.svg(figure, "inverse-surface")
+        drawn = plots.svg(figure, name)
     caption = "The misfit is the mean of the steps since the measurement before; the others are of all held-out views."
     return Plot(drawn, caption)
 

@@ -1,4 +1,4 @@
-"""The command `filterlab`: render | mesh | scene | sdf | resample | convert | recommend | methods | info.
+"""The command `filterlab`: render, mesh, scene, terrain, sdf, slim, resample, convert, recommend, methods, info.
 
 Exit codes: 0 done, 1 a mistake in what was asked (a message on stderr), 2 a command line that makes no sense,
 3 `recommend` found nothing within the budget, 130 interrupted.

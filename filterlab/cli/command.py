@@ -8,13 +8,12 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import version
 from typing import Annotated, Any, Union
 
 import tyro
 from tyro.conf import subcommand
 
-from filterlab.cli.convert import Convert
+from filterlab.cli.convert import Convert, with_output_last
 from filterlab.cli.info import Info
 from filterlab.cli.mesh import Mesh
 from filterlab.cli.methods import Methods
@@ -25,7 +24,9 @@ from filterlab.cli.resample import Resample
 from filterlab.cli.scene import Scene
 from filterlab.cli.scenes import split_overrides
 from filterlab.cli.sdf import Sdf
+from filterlab.cli.slim import Slim
 from filterlab.cli.terminal import tell
+from filterlab.cli.terrain import Terrain
 from filterlab.names import unknown_name
 from filterlab.notices import Notice
 
@@ -37,7 +38,9 @@ COMMANDS: dict[str, Any] = {
     "render": Render,
     "mesh": Mesh,
     "scene": Scene,
+    "terrain": Terrain,
     "sdf": Sdf,
+    "slim": Slim,
     "resample": Resample,
     "convert": Convert,
     "recommend": Recommend,
@@ -52,10 +55,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments in (["--version"], ["-V"]):
+        from importlib.metadata import version
+
         print(f"filterlab {version('filterlab')}")
         return OK
     overrides: dict[str, str] = {}
     try:
+        if arguments[:1] == ["convert"]:
+            arguments = with_output_last(arguments)
         if arguments and arguments[0] in SHOWING:
             arguments, overrides = split_overrides(SHOWING[arguments[0]], arguments)
         with _warnings_told():

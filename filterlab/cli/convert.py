@@ -18,6 +18,14 @@ if TYPE_CHECKING:
     from filterlab.io.bounded import VolumeHeader
 
 
+def with_output_last(arguments: list[str]) -> list[str]:
+    """`IN -o OUT`, as other commands take it, as `IN OUT`."""
+    place = next((i for i, argument in enumerate(arguments[:-1]) if argument in ("-o", "--output")), None)
+    if place is None:
+        return arguments
+    return [*arguments[:place], *arguments[place + 2 :], arguments[place + 1]]
+
+
 @dataclass(frozen=True)
 class Convert:
     """Write a volume as a file of another format: the same voxels at the same place.
@@ -36,7 +44,7 @@ class Convert:
     input: Annotated[Positional[Path], arg(metavar="IN")]
     """The volume: a file, or a folder of DICOM files or numbered TIFF slices."""
     output: Annotated[Positional[Path], arg(metavar="OUT")]
-    """The volume to write; its ending tells the format. A file of that name is replaced."""
+    """The volume to write, also as `-o OUT`; its ending tells the format. A file of that name is replaced."""
     frame: Frame = None
     """Which volume of a time series (or entry of a batch), from 0."""
     channel: Channel = None

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from filterlab.io.bounded import VolumeHeader
+    from filterlab.io.heights_header import HeightsHeader
 
 BINS = 16
 AT_ONCE = 2**17  # numbers
@@ -26,43 +27,120 @@ AT_ONCE = 2**17  # numbers
 
 @dataclass(frozen=True)
 class Info:
-    """Show what is in a volume file: its header, where it lies in the world, and how its values are distributed.
+    """Show what is in a file of a volume, of heights or of a SLIM surface: its header, where it lies, and its values.
 
     examples:
       filterlab info engine.nrrd
+      filterlab info dem.tif
       filterlab info scan.nii.gz --header-only
       filterlab info series.nii.gz --frame 3
+      filterlab info bunny.npz
     """
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """The volume: a file, or a folder of numbered TIFF slices."""
+    """The volume: a file, or a folder of numbered TIFF slices; or heights (GeoTIFF, .npy, .npz, PNG of 16 bits); or a
+    SLIM surface (.npz)."""
     header_only: Annotated[bool, arg(aliases=["-H"])] = False
     """Do not read the voxels."""
     frame: Frame = None
     """Which volume of a time series (or entry of a batch), from 0."""
     channel: Channel = None
-    """Which of several values per voxel, from 0."""
+    """Which of several values per voxel (or band of a map), from 0."""
 
     def run(self, overrides: dict[str, str]) -> None:
-        from rich.table import Table
-        from rich.text import Text
+        from filterlab.io.heights import holds_heights
 
+        if _holds_slim(self.file):
+            _show_lines(_lines_of_slim(self.file))
+        elif holds_heights(self.file):
+            self._tell_heights()
+        else:
+            self._tell_volume()
+
+    def _tell_volume(self) -> None:
         from filterlab.io.volumes import MAX_BYTES, describe
 
         header = describe(self.file, frame=self.frame, channel=self.channel)
-        table = Table(show_header=False, box=None)
-        for name, value in _described(header):
-            table.add_row(name, Text(value))
-        show(table)
+        _show_lines(_described(header))
         if not self.header_only and _tell_open_choice(header):
-            with progress_bar() as progress:
-                with reading(progress):
-                    samples = header.read(MAX_BYTES)
-                found = _distribution(samples, lambda done: progress(done, "counting"))
-            table = Table(show_header=False, box=None)
-            for name, value in found:
-                table.add_row(name, Text(value))
-            show(table)
+            self._tell_values(lambda: header.read(MAX_BYTES))
+
+    def _tell_heights(self) -> None:
+        from filterlab.io.heights import MAX_BYTES, describe_heights
+
+        header = describe_heights(self.file, band=None if self.channel is None else self.channel + 1)
+        _show_lines(_described_heights(header))
+        if not self.header_only:
+            self._tell_values(lambda: header.read(MAX_BYTES).samples)
+
+    def _tell_values(self, read: Callable[[], np.ndarray]) -> None:
+        with progress_bar() as progress:
+            with reading(progress):
+                samples = read()
+            found = _distribution(samples, lambda done: progress(done, "counting"))
+        _show_lines(found)
+
+
+def _show_lines(lines: Sequence[tuple[str, str]]) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None)
+    for name, value in lines:
+        table.add_row(name, Text(value))
+    show(table)
+
+
+def _described_heights(header: HeightsHeader) -> list[tuple[str, str]]:
+    """Lines about the header of a file of heights."""
+    rows, columns = header.shape
+    (dx, dy), (x, y) = header.spacing, header.origin
+    own = header.dtype.name
+    ends = [sorted((o, o + (n - 1) * d)) for o, n, d in ((x, columns, dx), (y, rows, dy))]
+    return [
+        ("file", f"{header.path} ({header.format}, {header.encoding})"),
+        ("size (x, y)", f"{columns} × {rows}"),
+        ("type", header.stored if header.stored == own else f"{header.stored}, read as {own}"),
+        ("memory", f"{header.nbytes / 2**20:.4g} MiB"),
+        ("spacing", f"{dx:.6g} {dy:.6g}" + (" (rows from the north)" if dy < 0 else "")),
+        ("x", f"{ends[0][0]:.10g} … {ends[0][1]:.10g}"),
+        ("y", f"{ends[1][0]:.10g} … {ends[1][1]:.10g}"),
+        ("unit", f"{header.unit or 'not declared'}; of heights: {header.height_unit or 'not declared'}"),
+        ("reference system", _reference(header)),
+        *header.fields.items(),
+    ]
+
+
+def _reference(header: HeightsHeader) -> str:
+    if header.crs is None:
+        return "not declared"
+    code = header.crs if header.crs.startswith("EPSG:") else None
+    return " ".join(filter(None, (header.crs_name, code and f"({code})"))) or "WKT"
+
+
+def _holds_slim(path: Path) -> bool:
+    if path.suffix.lower() != ".npz":
+        return False
+    from filterlab.io.covers import is_slim
+
+    return is_slim(path)
+
+
+def _lines_of_slim(path: Path) -> list[tuple[str, str]]:
+    """Lines about the SLIM surface in a file."""
+    from filterlab.io.covers import load_slim
+
+    slim = load_slim(path)
+    radii, cuts = slim.radii.double(), 0 if slim.cuts is None else slim.cuts.shape[1]
+    lower, upper = slim.domain.lower, slim.domain.upper
+    return [
+        ("file", f"{path} (SLIM surface)"),
+        ("balls", f"{len(slim):,}, {str(slim.A.dtype).removeprefix('torch.')}"),
+        ("radii", f"{float(radii.min()):.6g} … {float(radii.max()):.6g}, median {float(radii.median()):.6g}"),
+        ("planes", f"up to {cuts} for each" if cuts else "none: no ball is cut"),
+        ("x, y, z", "; ".join(f"{a:.6g} … {b:.6g}" for a, b in zip(lower, upper, strict=True))),
+        ("shown", f"{slim.faces} faces, blended over {slim.offset:g} radii"),
+    ]
 
 
 def _described(header: VolumeHeader) -> list[tuple[str, str]]:

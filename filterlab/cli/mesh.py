@@ -10,7 +10,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from filterlab.cli.loading import reading
-from filterlab.cli.options import Quiet, check_asked, check_name
+from filterlab.cli.options import Maybe, Quiet, check_asked, check_name
 from filterlab.cli.saving import OutputFile
 from filterlab.cli.scenes import scene_asked_for
 from filterlab.cli.terminal import progress_bar, show, tell
@@ -32,7 +32,7 @@ class Mesh:
 
     scene: Annotated[Positional[Path], arg(metavar="VOLUME | SCENE.yaml")]
     """The volume, with --level; or a scene with a surface."""
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
+    output: Annotated[Maybe[Path], arg(aliases=["-o"], metavar="FILE")] = None
     """The mesh to write: a name that ends in .ply, .obj or .stl; a file of that name is replaced."""
     step: float = 1.0
     """Between the points of the grid that triangles are made on, in voxels."""
@@ -60,7 +60,7 @@ class Mesh:
         from filterlab.scenes.plan_report import table
         from filterlab.surfaces.meshes import mesh
 
-        scene = scene_asked_for(self.scene, overrides, self.output, of_surface=True)
+        scene, _ = scene_asked_for(self.scene, overrides, self.output, of_surface=True)
         with progress_bar(self.quiet) as progress, reading(progress):
             prepared = build(scene)
         assert isinstance(prepared, PreparedSurface)

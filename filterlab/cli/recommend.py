@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from filterlab import names
 from filterlab.cli.loading import load
-from filterlab.cli.options import MEMORY, TIME, Channel, Frame, Quiet, check_name, quantity
+from filterlab.cli.options import MEMORY, TIME, Channel, Frame, Maybe, Quiet, check_name, quantity
 from filterlab.cli.outcome import NOTHING_FITS, OK
 from filterlab.cli.saving import OutputFile
 from filterlab.cli.terminal import progress_bar, show
@@ -36,9 +36,9 @@ class Recommend:
     """The error that is allowed, in parts of the range of the volume's values: 0.5% or 0.005."""
     task: str = "resample"
     """What is done with it: resample (values), dvr or isosurface (gradients count as well)."""
-    max_memory: Annotated[str | None, arg(metavar="256MiB")] = None
+    max_memory: Annotated[Maybe[str], arg(metavar="256MiB")] = None
     """What the coefficients may take, like 256MiB or 2GB."""
-    max_time: Annotated[str | None, arg(metavar="30s")] = None
+    max_time: Annotated[Maybe[str], arg(metavar="30s")] = None
     """What prefiltering and doing the task once may take, like 500ms, 30s or 2min."""
     boundary: str = "mirror"
     """How the volume goes on beyond its ends: mirror, reflect, wrap, border or zeros."""
@@ -48,7 +48,7 @@ class Recommend:
     """Which volume of a time series (or entry of a batch), from 0."""
     channel: Channel = None
     """Which of several values per voxel, from 0."""
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="SCENE.yaml")] = None
+    output: Annotated[Maybe[Path], arg(aliases=["-o"], metavar="SCENE.yaml")] = None
     """A scene to write, for `filterlab render`; a file of that name is replaced."""
     json: bool = False
     """Print the answer as JSON."""

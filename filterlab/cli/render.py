@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from filterlab.cli.loading import Progress, reading
-from filterlab.cli.options import Quiet, check_asked
+from filterlab.cli.options import Maybe, Quiet, check_asked
 from filterlab.cli.saving import OutputFile
 from filterlab.cli.scenes import scene_asked_for
 from filterlab.cli.terminal import progress_bar, show
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from filterlab.scenes.build import AnyPrepared
     from filterlab.scenes.model import Scene
+    from filterlab.volume import Volume
 
 
 @dataclass(frozen=True)
@@ -47,10 +48,10 @@ class Render:
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE.yaml | VOLUME")]
     """The scene, or a volume."""
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
+    output: Annotated[Maybe[Path], arg(aliases=["-o"], metavar="FILE")] = None
     """The picture to write: a name that ends in .png or .jpg (quality 95); a file of that name is replaced. With
     --turntable .gif, .png (animated), or a folder for numbered .png files, which must be new or empty."""
-    turntable: Annotated[int | None, arg(metavar="N")] = None
+    turntable: Annotated[Maybe[int], arg(metavar="N")] = None
     """Make N pictures, a whole turn of the camera about what is up, through its target."""
     explain: bool = False
     """Show what the picture would take, and what the scene leaves out; no picture is made."""
@@ -60,47 +61,38 @@ class Render:
     def run(self, overrides: dict[str, str]) -> None:
         check_asked(self.output, self.explain, ".png")
         output = None if self.output is None else self._output(self.output)
-        scene = scene_asked_for(self.scene, overrides, self.output)
+        scene, volume = scene_asked_for(self.scene, overrides, self.output)
         if self.turntable is not None:
             from filterlab.scenes.turntable import check_turn
 
             check_turn(scene, self.turntable)
         if output is None:
-            self._explain(scene)
+            self._explain(scene, volume)
             return
         with progress_bar(self.quiet) as progress, reading(progress):
-            pictures = _Pictures(self._views(scene), progress)
+            pictures = _Pictures(self._views(scene, volume), progress)
             self._write(pictures, output.path)
         output.tell(pictures.told)
 
-    def _views(self, scene: Scene) -> list[AnyPrepared]:
+    def _views(self, scene: Scene, volume: Volume | None) -> list[AnyPrepared]:
         from filterlab.scenes.build import build
         from filterlab.scenes.turntable import turntable
 
-        prepared = build(scene)
+        prepared = build(scene, volume)
         return [prepared] if self.turntable is None else turntable(prepared, self.turntable)
 
-    def _explain(self, scene: Scene) -> None:
+    def _explain(self, scene: Scene, volume: Volume | None) -> None:
         from filterlab.scenes.plan import plan
         from filterlab.scenes.plan_report import table
 
-        views = self._views(scene)
+        views = self._views(scene, volume)
         show(table(plan(views[0]), pictures=len(views)))
 
     def _write(self, pictures: _Pictures, output: Path) -> None:
-        from filterlab.io.atomic import atomic_folder
-        from filterlab.io.images import save_animation, save_image
+        from filterlab.cli.pictures import write_pictures
         from filterlab.scenes.turntable import seconds_of_each
 
-        count = len(pictures.views)
-        if self.turntable is None:
-            save_image(next(iter(pictures)), output)
-        elif output.suffix:
-            save_animation(pictures, output, seconds=seconds_of_each(count))
-        else:
-            with atomic_folder(output) as folder:
-                for k, picture in enumerate(pictures):
-                    save_image(picture, folder / f"{k:0{max(3, len(str(count - 1)))}d}.png")
+        write_pictures(pictures, output, moving=self.turntable is not None, seconds=seconds_of_each(len(pictures)))
 
     def _output(self, output: Path) -> OutputFile:
         from filterlab.io.picture_formats import ANIMATIONS, PICTURES, format_of
@@ -122,6 +114,9 @@ class _Pictures:
     views: list[AnyPrepared]
     progress: Progress
     told: str = ""
+
+    def __len__(self) -> int:
+        return len(self.views)
 
     def __iter__(self) -> Iterator[Tensor]:
         from filterlab.scenes.build import picture

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from filterlab import names
 from filterlab.cli.loading import load
 from filterlab.cli.memory import as_float, check_memory, limit_in_bytes
-from filterlab.cli.options import Channel, Frame, Output, Quiet, Triple, check_name, result_type
+from filterlab.cli.options import Channel, Frame, Maybe, Output, Quiet, Triple, check_name, result_type
 from filterlab.cli.outcome import UsageError
 from filterlab.cli.saving import OutputFile
 from filterlab.cli.terminal import progress_bar, tell
@@ -49,13 +49,13 @@ class Resample:
     """The volume to write; a file of that name is replaced."""
     method: str = "triquadratic"
     """How values between the voxels are found; `filterlab methods` lists the names."""
-    spacing: Annotated[Triple | None, arg(metavar="SX SY SZ")] = None
+    spacing: Annotated[Maybe[Triple], arg(metavar="SX SY SZ")] = None
     """New size of a voxel along x, y, z, in the volume's own units."""
-    shape: Annotated[tuple[int, int, int] | None, arg(metavar="NX NY NZ")] = None
+    shape: Annotated[Maybe[tuple[int, int, int]], arg(metavar="NX NY NZ")] = None
     """Instead of it: new number of voxels along x, y, z."""
-    like: Annotated[Path | None, arg(metavar="FILE")] = None
+    like: Annotated[Maybe[Path], arg(metavar="FILE")] = None
     """Instead of it: a volume file whose grid is taken over."""
-    affine: Annotated[Path | None, arg(metavar="FILE")] = None
+    affine: Annotated[Maybe[Path], arg(metavar="FILE")] = None
     """A 4×4 matrix as text that moves IN first. With none of --spacing, --shape, --like onto the grid that IN had."""
     convention: str = "world"
     """What the matrix means. world: it leads points of IN to where they go, in world coordinates as `filterlab info`
@@ -63,9 +63,9 @@ class Resample:
     LPS. fsl: FLIRT's -omat, from -in to -ref, in voxels times their sizes."""
     inverse: bool = False
     """The matrix was made the other way round, to move onto IN what is moved back now."""
-    flirt_in: Annotated[Path | None, arg(metavar="FILE")] = None
+    flirt_in: Annotated[Maybe[Path], arg(metavar="FILE")] = None
     """For fsl: the volume that was FLIRT's -in. Default: IN (with --inverse that of --like)."""
-    flirt_ref: Annotated[Path | None, arg(metavar="FILE")] = None
+    flirt_ref: Annotated[Maybe[Path], arg(metavar="FILE")] = None
     """For fsl: the volume that was FLIRT's -ref. Default: that of --like (with --inverse IN)."""
     boundary: str = "mirror"
     """How the volume goes on beyond its ends: mirror, reflect, wrap, border or zeros."""
@@ -75,13 +75,13 @@ class Resample:
     """Which volume of a time series (or entry of a batch), from 0."""
     channel: Channel = None
     """Which of several values per voxel, from 0: components of vectors, colours, dyes."""
-    fill: float | None = None
+    fill: Maybe[float] = None
     """The value of voxels outside of IN, for --like, --affine; `nan` too. Default: none, the boundary rules there."""
     labels: bool = False
     """The values of IN are names, not amounts: of each the method reconstructs where it is, and the strongest wins."""
     antialias: bool = False
     """Leave out what a coarser grid does not hold; without it fine detail comes back as coarse patterns."""
-    dtype: str | None = None
+    dtype: Maybe[str] = None
     """Type of the result: float32, float64, an integer type (rounded and clipped), or `input` for the type of IN.
     Default: `input` for labels and for the method nearest, else float32, or float64 if that is what the values need."""
     nifti2: bool = False
@@ -119,12 +119,12 @@ class Resample:
 
         import torch
 
-        from filterlab.resampling import resample
+        from filterlab.resampling import check_fill, resample
         from filterlab.volume import Volume
 
         working = _working_type(stored, source)
         check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)
-        self._check_fill(stored)
+        check_fill(self.fill, stored or "float32", "--fill")
         limit = limit_in_bytes(self.max_gigabytes)
         shape = [*source.shape[:-3], *self._new_size(source, target)]
         itemsize = max(working.itemsize, source.dtype.itemsize if keeps else 0, np.dtype(stored or "float32").itemsize)
@@ -170,16 +170,6 @@ class Resample:
         volume = source if moved is None else describe(moved)
         onto_grid = (target or source) if onto is None else describe(onto)
         return load_affine(self.affine, self.convention, volume=volume, target=onto_grid, inverse=self.inverse)
-
-    def _check_fill(self, stored: str | None) -> None:
-        """Raises ValueError for a fill that no integer of the result is."""
-        import numpy as np
-
-        if self.fill is None or stored is None or stored.startswith("float"):
-            return
-        info = np.iinfo(stored)
-        if not (math.isfinite(self.fill) and self.fill == int(self.fill) and info.min <= self.fill <= info.max):
-            raise ValueError(f"expected a --fill that {stored} holds; got {self.fill:g}")
 
     def _new_size(self, source: VolumeHeader, target: VolumeHeader | None) -> list[float]:
         """Voxels along x, y, z of the result; checks what was asked."""

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from filterlab.cli.options import Maybe
 from filterlab.cli.outcome import UsageError
 from filterlab.cli.scenes import scene_asked_for
 
@@ -24,7 +25,7 @@ class Scene:
       filterlab scene engine.nrrd > engine.yaml
     """
 
-    scene: Annotated[Positional[Path | None], arg(metavar="SCENE.yaml | VOLUME")] = None
+    scene: Annotated[Positional[Maybe[Path]], arg(metavar="SCENE.yaml | VOLUME")] = None
     """The scene that is shown, or a volume: then the scene that shows it."""
     reference: bool = False
     """Print the reference of scene files instead: every key, what it may be, its unit, its default (Markdown)."""
@@ -39,4 +40,4 @@ class Scene:
             return
         from filterlab.io.config import dump_config
 
-        print(dump_config(scene_asked_for(self.scene, overrides, None)), end="")
+        print(dump_config(scene_asked_for(self.scene, overrides, None)[0]), end="")

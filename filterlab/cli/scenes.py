@@ -13,33 +13,48 @@ from filterlab.cli.outcome import UsageError
 
 if TYPE_CHECKING:
     from filterlab.scenes.model import Scene
+    from filterlab.volume import Volume
 
 
-def scene_asked_for(path: Path, overrides: dict[str, str], output: Path | None, *, of_surface: bool = False) -> Scene:
-    """The scene in a file; or of a volume, as overrides ask, its surface, greatest values or slice, else as it is.
+def scene_asked_for(
+    path: Path, overrides: dict[str, str], output: Path | None, *, of_surface: bool = False
+) -> tuple[Scene, Volume | None]:
+    """The scene in a file; of a SLIM surface; or of a volume, as overrides ask, its surface, greatest values or slice,
+    else as it is.
+
+    With it its volume, if that has been read.
 
     Raises ValueError for one without a surface where it has to be `of_surface`, of a volume before that is read.
     """
-    from filterlab.scenes.build import load_scene, surface_scene, values_scene
-    from filterlab.scenes.default import default_scene
+    from filterlab.io.covers import is_slim
+    from filterlab.scenes.build import load_scene, slim_scene, surface_scene, values_scene
+    from filterlab.scenes.default import default_view
 
     part = {name: overrides.pop(name) for name in ("frame", "channel") if name in overrides}
     level = overrides.pop("level", None)
+    volume = None
     chosen = overrides | {f"volume.{name}": index for name, index in part.items()}
-    if level is not None:
+    if is_slim(path):
+        if level is not None or part:
+            raise ValueError(f"expected no --level, --frame and --channel of a SLIM surface; got some: {path}")
+        scene = slim_scene(path, chosen)
+    elif level is not None:
         scene = surface_scene(path, level, chosen)
     elif path.suffix.lower() in (".yaml", ".yml", "") or not path.is_file():
         scene = load_scene(path, chosen)
     elif {name.partition(".")[0] for name in chosen} & {"mip", "slice"}:
         scene = values_scene(path, chosen)
     else:
-        scene = None if of_surface else default_scene(path, chosen)
+        scene, volume = (None, None) if of_surface else default_view(path, chosen)
     if scene is None or (of_surface and scene.surface is None):
         raise ValueError(f"expected a scene with a surface, or a volume and --level; got neither: {path}")
-    if scene.volume is not None and output is not None:
-        check_not_input(output, Path(scene.volume.file))
+    if of_surface and scene.slim is not None:
+        raise ValueError(f"expected a level set, of which triangles are made; got a SLIM surface: {path}")
+    source = scene.slim if scene.volume is None else scene.volume.file
+    if source is not None and output is not None:
+        check_not_input(output, Path(source))
     check_device(scene.device)
-    return scene
+    return scene, volume
 
 
 def split_overrides(command: type, arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:

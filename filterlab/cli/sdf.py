@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from filterlab.cli.memory import check_memory, limit_in_bytes
-from filterlab.cli.options import Output, Quiet, Triple, check_name
+from filterlab.cli.options import Maybe, Output, Quiet, Triple, check_name
 from filterlab.cli.outcome import UsageError
 from filterlab.cli.saving import OutputFile
 from filterlab.cli.terminal import progress_bar, tell
@@ -37,11 +37,11 @@ class Sdf:
     """The mesh."""
     output: Output
     """The volume to write; a file of that name is replaced."""
-    size: Annotated[int | None, arg(metavar="N")] = None
+    size: Annotated[Maybe[int], arg(metavar="N")] = None
     """Voxels along the longest side; default 128."""
-    shape: Annotated[tuple[int, int, int] | None, arg(metavar="NX NY NZ")] = None
+    shape: Annotated[Maybe[tuple[int, int, int]], arg(metavar="NX NY NZ")] = None
     """Instead of it: number of voxels along x, y, z, each side divided on its own."""
-    spacing: Annotated[Triple | None, arg(metavar="SX SY SZ")] = None
+    spacing: Annotated[Maybe[Triple], arg(metavar="SX SY SZ")] = None
     """Instead of it: size of a voxel along x, y, z, in the mesh's own units."""
     margin: float = 3.0
     """Voxels that are kept free around the mesh, on every side."""

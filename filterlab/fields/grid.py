@@ -26,6 +26,7 @@ from filterlab.ops.differentiable import raycast as casting
 from filterlab.ops.differentiable.prefilter import implementation_for
 from filterlab.ops.pieces import Lattice, Pieces
 from filterlab.ops.place import Placement
+from filterlab.ops.prefilter import VOLUME
 from filterlab.ops.raycast import Candidates, Raycast
 from filterlab.ops.reference.pieces import in_cells, pieces_of_rays
 from filterlab.ops.stencil import Product, Stencil
@@ -51,6 +52,7 @@ class Scheme(Protocol):
         reach: coefficients needed on each side of a point's cell.
         terms: the value as a sum of separable terms (what `resample` uses).
         exact: whether the value is that sum but for rounding: not where a texture unit's fractions are modelled.
+        single: the axes x, y, z of which one coefficient is enough.
     """
 
     @property
@@ -65,6 +67,8 @@ class Scheme(Protocol):
     def terms(self) -> tuple[Term, ...]: ...
     @property
     def exact(self) -> bool: ...
+    @property
+    def single(self) -> tuple[bool, bool, bool]: ...
 
     def evaluation(self, coefficients: Coefficients, placement: Placement, order: int) -> Evaluation:
         """What gives the jet of that order of coefficients (N, C, D', H', W'); all that no point changes is settled.
@@ -94,7 +98,8 @@ class Coefficients:
     Attributes:
         values: (..., D', H', W'); (N, C, D', H', W') where a scheme reads them.
         start: the first coefficient lies at start + shift in voxel coordinates, the same along every axis.
-        shift: 0, or ½ for coefficients at half-integers (the notch).
+        shift: along x, y, z: 0, ½ for coefficients at half-integers (the notch), or, along an axis of one coefficient,
+            what brings it to where the points are.
         size: voxels of the volume along x, y, z.
         boundary: the extension of the samples.
         tail: how far beyond the ends points are told apart (border and zeros); the extension is constant beyond.
@@ -103,7 +108,7 @@ class Coefficients:
 
     values: Tensor
     start: int
-    shift: float
+    shift: tuple[float, float, float]
     size: tuple[int, int, int]
     boundary: Boundary
     tail: int
@@ -119,33 +124,38 @@ class Coefficients:
         factor: Factor | None = None,
         storage: torch.dtype | None = None,
         unknown: Tensor | None = None,
+        single: tuple[bool, bool, bool] = (False, False, False),
     ) -> Coefficients:
         """Prefilter, extend by the boundary, apply the discrete part of a factored kernel, and store.
+
+        Along the axes x, y, z that are `single` nothing is done: their one sample is the coefficient everywhere.
 
         Where `unknown`, a mask of the samples, coefficients are NaN: after the prefilter, which would spread them.
 
         Memory: (n + 2·pad)³ coefficients, pad = reach (+1 for a factored kernel) under mirror, reflect and wrap;
-        under border and zeros 2·reach plus the prefilter's decay (about 10 … 50 voxels, see `Prefilter.decay`).
+        under border and zeros 2·reach plus the prefilter's decay (about 10 … 50 voxels, see `Prefilter.decay`); 1 along
+        an axis that is `single`.
         """
         reach = reach if factor is None else reach + 1
         decay = 0 if boundary.periodic else prefilter.decay(torch.promote_types(samples.dtype, torch.float32))
         tail = 0 if boundary.periodic else decay + reach
         pad = reach + tail - decay
+        dims, start = [dim for dim in VOLUME if not single[-1 - dim]], -(pad + decay)
         values = samples
         if not prefilter.is_identity:  # periodic coefficients extend as the samples do
             filtered = pad if boundary.periodic else decay
-            values = ops.prefilter_samples(samples, prefilter, boundary, filtered, implementation_for(samples))
+            values = _prefiltered(samples, dims, prefilter, boundary, filtered)
         if prefilter.is_identity or not boundary.periodic:
-            for dim in (-3, -2, -1):
-                values = boundary.extend(values, dim, pad, pad)
+            values = _extended(values, dims, boundary, pad)
         if unknown is not None:
-            values = values.masked_fill(_extended(unknown, boundary, pad + decay), torch.nan)
+            values = values.masked_fill(_extended(unknown, dims, boundary, pad + decay), torch.nan)
         shift = 0.0
         if factor is not None:
-            values, shift = _apply_factor(values, factor), 0.5
+            values, shift = _apply_factor(values, dims, factor), 0.5
         values, quantization = stored_as(values, storage)
         d, h, w = samples.shape[-3:]
-        return cls(values, -(pad + decay), shift, (w, h, d), boundary, tail, quantization)
+        x, y, z = (-start if alone else shift for alone in single)
+        return cls(values, start, (x, y, z), (w, h, d), boundary, tail, quantization)
 
     def __getitem__(self, index: tuple[int, int]) -> Coefficients:
         """Those of entry n and channel c of a batch."""
@@ -165,7 +175,7 @@ class Coefficients:
         row = tuple(Product(term.kernels, weight=term.weight) for term in terms)
         values, offset = self.values, []
         for axis, (n, support) in enumerate(zip(self.size, Stencil((row,)).supports, strict=True)):
-            zero = self.start + self.shift + support / 2 - 1  # where the first cell of all begins
+            zero = self.start + self.shift[axis] + support / 2 - 1  # where the first cell of all begins
             first, last = math.floor(-0.5 - zero), math.ceil(n - 0.5 - zero)
             values = values.narrow(-1 - axis, first, last - first + support - 1)
             offset.append(first + zero)
@@ -179,10 +189,20 @@ class Coefficients:
         return Placement(geometry, self.boundary, self.size, self.tail, self.shift)
 
 
-def _extended(mask: Tensor, boundary: Boundary, reach: int) -> Tensor:
-    for dim in (-3, -2, -1):
-        mask = boundary.extend(mask, dim, reach, reach)
-    return mask
+def _prefiltered(samples: Tensor, dims: list[int], prefilter: Prefilter, boundary: Boundary, tail: int) -> Tensor:
+    implementation = implementation_for(samples)
+    if len(dims) == len(VOLUME):
+        return ops.prefilter_samples(samples, prefilter, boundary, tail, implementation)
+    values = samples.to(torch.promote_types(samples.dtype, torch.float32))
+    for dim in dims:
+        values = ops.prefilter_axis(values, dim, prefilter, boundary, tail, implementation)
+    return values
+
+
+def _extended(values: Tensor, dims: list[int], boundary: Boundary, reach: int) -> Tensor:
+    for dim in dims:
+        values = boundary.extend(values, dim, reach, reach)
+    return values
 
 
 def implementation_of(scheme: str, device: torch.device) -> str:
@@ -192,12 +212,12 @@ def implementation_of(scheme: str, device: torch.device) -> str:
     return "cuda" if device.type == "cuda" else "cpu"
 
 
-def _apply_factor(values: Tensor, factor: Factor) -> Tensor:
-    """Averages of neighbours along every axis: the coefficients at half-integers, one fewer per axis."""
+def _apply_factor(values: Tensor, dims: list[int], factor: Factor) -> Tensor:
+    """Averages of neighbours along these axes: the coefficients at half-integers, one fewer per axis."""
     assert [float(o) for o in factor.offsets] == [0.5, -0.5], "only half-shifted pairs are factored"
     first, second = (float(w) for w in factor.weights)
     values = values.to(torch.promote_types(values.dtype, torch.float32))
-    for dim in (-3, -2, -1):
+    for dim in dims:
         n = values.shape[dim] - 1
         values = first * values.narrow(dim, 0, n) + second * values.narrow(dim, 1, n)
     return values

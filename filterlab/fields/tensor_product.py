@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from functools import cached_property, wraps
 from itertools import chain, product
 from typing import Any, TypeVar
@@ -20,9 +21,11 @@ from torch import Tensor
 
 from filterlab import ops
 from filterlab.fields.grid import Coefficients, Evaluation, Term, implementation_of
-from filterlab.kernels import CENTRAL_DIFFERENCE, LINEAR, PiecewisePolynomial, bspline, horner
+from filterlab.kernels import CENTRAL_DIFFERENCE, LINEAR, Kernel, PiecewisePolynomial, bspline, horner
 from filterlab.ops import Product, Stencil, multi_indices
 from filterlab.ops.place import Placement
+from filterlab.ops.stencil import Kernels
+from filterlab.volume import Boundary
 
 Sampler = Callable[[Coefficients, Tensor], Tensor]
 """(coefficients with values (N, C, D, H, W), points (N, M, 3)) -> trilinear samples (N, C, M).
@@ -89,6 +92,26 @@ def same_kernel(kernel: PiecewisePolynomial) -> tuple[Term, ...]:
     return (Term(1.0, (kernel, kernel, kernel)),)
 
 
+def summed_along(terms: tuple[Term, ...], single: tuple[bool, bool, bool]) -> tuple[Term, ...]:
+    """Terms over coefficients that are the same all along some axes: one coefficient serves for the taps of each.
+
+    Its weight is Σ_k φ(x − k), which is the same at every x. Terms that differ in nothing else are one.
+    """
+    weights: dict[Kernels, float] = {}
+    for term in terms:
+        weight, kernels = term.weight, list(term.kernels)
+        for axis in (axis for axis in range(3) if single[axis]):
+            weight *= float(_sum_over_translates(kernels[axis]) or 0)
+            kernels[axis] = bspline(0)
+        x, y, z = kernels
+        weights[x, y, z] = weights.get((x, y, z), 0.0) + weight
+    return tuple(Term(weight, kernels) for kernels, weight in weights.items())
+
+
+def _sum_over_translates(kernel: PiecewisePolynomial) -> Fraction | None:
+    return kernel.sum_over_translates if isinstance(kernel, Kernel) else None
+
+
 def along(axis: int, kernel: PiecewisePolynomial, others: PiecewisePolynomial = LINEAR) -> Term:
     """`kernel` along one axis (0 = x), `others` along the other two."""
     kernels = [others] * 3
@@ -111,15 +134,25 @@ class Direct:
         terms: the value.
         gradient: `analytic`: derivatives of the terms, up to the Hessian. `central`: differences of the trilinear
             interpolant, and nothing beyond.
+        single: the axes x, y, z of one coefficient.
     """
 
     terms: tuple[Term, ...]
     name: str = "direct"
     gradient: str = "analytic"
     exact: bool = True
+    single: tuple[bool, bool, bool] = (False, False, False)
 
     def __post_init__(self) -> None:
         _ = self.stencils  # made now: torch.compile can't make them while it traces
+
+    def along(self, size: Sequence[int], boundary: Boundary) -> Direct:
+        """The same of a volume of so many voxels along x, y, z: axes of one that goes on as it is are single."""
+        sums = [_sum_over_translates(kernel) for term in self.terms for kernel in term.kernels]
+        if boundary is Boundary.ZEROS or None in sums:
+            return self
+        x, y, z = (n == 1 for n in size)
+        return replace(self, terms=summed_along(self.terms, (x, y, z)), single=(x, y, z))
 
     @property
     def max_order(self) -> int:
@@ -134,7 +167,8 @@ class Direct:
         """What is summed for a jet of order 0, 1, … `max_order`."""
         value = tuple(Product(term.kernels, weight=term.weight) for term in self.terms)
         if self.gradient == "central":
-            differences = tuple((Product(term.kernels),) for term in CENTRAL_TERMS)
+            central = (summed_along((term,), self.single) for term in CENTRAL_TERMS)
+            differences = tuple((Product(term.kernels, weight=term.weight),) for (term,) in central)
             return Stencil((value,)), Stencil((value, *differences))
         return tuple(
             Stencil(tuple(tuple(replace(p, orders=orders) for p in value) for orders in multi_indices(order)))
@@ -156,6 +190,10 @@ class Sampled(ABC):
     @property
     def exact(self) -> bool:
         return self.sample is exact_sample
+
+    @property
+    def single(self) -> tuple[bool, bool, bool]:
+        return False, False, False
 
     @abstractmethod
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:

@@ -539,6 +539,7 @@ class OnTetrahedra:
         spline: what is summed.
         terms: none, the value is not separable.
         exact: not that of the terms.
+        single: no axis; what is constant along one does not give what is.
     """
 
     spline: Spline
@@ -547,6 +548,7 @@ class OnTetrahedra:
     max_order: int = 2
     terms: tuple[Term, ...] = ()
     exact: bool = False
+    single: tuple[bool, bool, bool] = (False, False, False)
 
     @property
     def reach(self) -> int:

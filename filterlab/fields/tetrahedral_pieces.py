@@ -12,10 +12,11 @@ Source: Kalbe and Zeilfelder 2008, section 5, and the walk through planes instea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -73,6 +74,18 @@ class Planes:
                 outer.add((normal, float((sum(normal) * spline.shift + d) % 1)))
                 inner.update(upright(turn(normal), Fraction(0))[0] for normal, _ in sides)
         return cls(tuple(sorted(outer)), tuple(sorted(inner)))
+
+
+class TetrahedralPieces(NamedTuple):
+    """Polynomials on tetrahedra.
+
+    Attributes:
+        corners: (M, 4, 3), in the world.
+        coefficients: (M, B) of the Bernstein form on them, in the order of `bernstein.multi_indices`.
+    """
+
+    corners: Tensor
+    coefficients: Tensor
 
 
 class FieldOnTetrahedra(GridField):
@@ -256,6 +269,35 @@ class FieldOnTetrahedra(GridField):
 
     def relevant(self, level: float) -> Relevant:
         """Cells whose centres lie in the domain, and tetrahedra of them."""
+        cells, total = 0, 0
+        for part, pieces in self._holding(level):
+            held = torch.zeros(len(part), dtype=torch.bool, device=part.device)
+            for number, _ in pieces:
+                held[number] = True
+                total += len(number)
+            cells += int(held.sum())
+        return Relevant(cells, total)
+
+    def relevant_tetrahedra(self, level: float) -> TetrahedralPieces:
+        """Those that `relevant` counts, in the world. They have no derivatives.
+
+        Raises as `relevant` does.
+        """
+        spline, corners, coefficients = self.scheme.spline, [], []
+        for cells, pieces in self._holding(level):
+            for (number, rows), (shape, turn) in zip(pieces, spline.tetrahedra, strict=True):
+                vertices = [[float(c) for c in turn(v)] for v in spline.shapes[shape].vertices]
+                middle = cells[number] + float(spline.shift)
+                corners.append(middle[:, None] + middle.new_tensor(vertices))
+                coefficients.append(rows)
+        none = self.coefficients.values.new_zeros(0, dtype=torch.float64)
+        every = torch.cat([none.reshape(0, 4, 3), *corners])
+        rows = torch.cat([none.reshape(0, len(bernstein.multi_indices(spline.degree, 3))), *coefficients])
+        return TetrahedralPieces(self.domain.geometry.to_world(every), rows)
+
+    def _holding(self, level: float) -> Iterator[tuple[Tensor, list[tuple[Tensor, Tensor]]]]:
+        """Parts of the cells (P, 3) that may hold a level; for each tetrahedron of a cell which of them do (H,), and
+        its coefficients there (H, B)."""
         self._check_pieces()
         spline, device = self.scheme.spline, self.coefficients.values.device
         axes = [torch.arange(n, dtype=torch.float64, device=device) for n in self.coefficients.size]
@@ -263,14 +305,16 @@ class FieldOnTetrahedra(GridField):
         if spline.period == 2:  # of one octahedron for every four voxels
             cells = cells[(cells % 2 == cells[:, :1] % 2).all(-1)]
         cells = cells[self.may_hold(cells, level, torch.float64)]
-        total, held = 0, torch.zeros(len(cells), dtype=torch.bool, device=device)
-        for part in torch.arange(len(cells), device=device).split(CHUNK):
-            for which in spline.tetrahedra:
-                low, high = bernstein.bounds(self._bernstein(_placed(cells[part], *which), torch.float64))
-                holds = (low <= level) & (level <= high)
-                held[part] |= holds
-                total += int(holds.sum())
-        return Relevant(int(held.sum()), total)
+        for part in cells.split(CHUNK):
+            every = (self._bernstein(_placed(part, *which), torch.float64) for which in spline.tetrahedra)
+            yield part, [_straddling(rows, level) for rows in every]
+
+
+def _straddling(rows: Tensor, level: float) -> tuple[Tensor, Tensor]:
+    """Numbers of the rows (P, B) that a level is between the numbers of, and these rows."""
+    low, high = bernstein.bounds(rows)
+    (number,) = ((low <= level) & (level <= high)).nonzero(as_tuple=True)
+    return number, rows[number]
 
 
 def _placed(cells: Tensor, shape: int, turn: Turn) -> Located:

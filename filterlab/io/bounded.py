@@ -251,10 +251,10 @@ def integer(path: Path, what: str, text: str) -> int:
     return int(text)
 
 
-def regular_file(path: Path) -> Path:
+def regular_file(path: Path, what: str = "a volume file") -> Path:
     """The path, if it is a file (no folder, pipe or device). Raises FileNotFoundError or VolumeFileError."""
     if not path.exists():
-        raise FileNotFoundError(f"{path}: expected a volume file; got no file of this name")
+        raise FileNotFoundError(f"{path}: expected {what}; got no file of this name")
     if not path.is_file():
         raise VolumeFileError(path, "a file", "a folder, pipe or device")
     return path
@@ -317,11 +317,12 @@ class Stored:
         if self.encoding not in EXPANSION and self.skip > MAX_SKIP:
             raise VolumeFileError(self.header, f"at most {MAX_SKIP} bytes before the samples", self.skip)
 
-    def read(self, at: Sequence[int | None] = ()) -> np.ndarray:
+    def read(self, at: Sequence[int | None] = (), target: np.dtype | None = None) -> np.ndarray:
         """The samples in native byte order, writable and contiguous.
 
         Args:
             at: for each of the first axes, the index that is read of it; None: all of it.
+            target: the type that they are to have in the end. Wider integers are made in place, where all is read.
         """
         self.check()
         with self.file.open("rb") as file:
@@ -329,7 +330,8 @@ class Stored:
             with damaged(self.header, f"{self.encoding} data of {self.nbytes} bytes"):
                 stream = decompressed(file, self.encoding)
                 skip_bytes(self.header, stream, self.skip)
-                return read_array(self.header, stream, self.shape, self.dtype, at, raw=self.encoding == "raw")
+                raw = self.encoding == "raw"
+                return read_array(self.header, stream, self.shape, self.dtype, at, raw=raw, target=target)
 
     def held(self, at: Sequence[int | None]) -> int:
         """How many values `read(at)` reads at once."""
@@ -342,9 +344,16 @@ def _leading(at: Sequence[int | None]) -> int:
 
 
 def read_array(
-    path: Path, stream: BinaryIO, shape: tuple[int, ...], dtype: np.dtype, at: Sequence[int | None], *, raw: bool
+    path: Path,
+    stream: BinaryIO,
+    shape: tuple[int, ...],
+    dtype: np.dtype,
+    at: Sequence[int | None],
+    *,
+    raw: bool,
+    target: np.dtype | None = None,
 ) -> np.ndarray:
-    """The array of that shape in a stream; of axes with an index in `at`, what lies there.
+    """The array of that shape in a stream; of axes with an index in `at`, what lies there; see `Stored.read`.
 
     All of it is passed over, so that damage anywhere is found. What comes behind it is told (of raw data, elsewhere).
     """
@@ -352,12 +361,28 @@ def read_array(
     first = int(np.ravel_multi_index(at[:leading], shape[:leading])) if leading else 0  # type: ignore[arg-type]
     parts, count = math.prod(shape[:leading]), math.prod(shape[leading:]) * dtype.itemsize
     skip_bytes(path, stream, first * count)
-    buffer = read_exactly(path, stream, count, allocate=raw, progress=tell_done)
+    rest = [*at, *[None] * (len(shape) - len(at))][leading:]
+    left = [n for n, index in zip(shape[leading:], rest, strict=True) if index is None]
+    whole = math.prod(left) == math.prod(shape[leading:])
+    times = target.itemsize // dtype.itemsize if target is not None and whole and target.kind == "i" else 1
+    buffer = read_exactly(path, stream, count, allocate=raw, progress=tell_done, times=times)
     skip_bytes(path, stream, (parts - 1 - first) * count)
     _tell_rest(path, stream, parts * count)
     array = native(buffer, dtype, shape[leading:])
-    rest = tuple(slice(None) if index is None else index for index in at[leading:])
-    return np.ascontiguousarray(array[rest]) if rest else array
+    if whole:
+        array = array.reshape(left)
+        return array if times == 1 else _widened(array, np.frombuffer(buffer, target).reshape(left))
+    return np.ascontiguousarray(array[tuple(slice(None) if index is None else index for index in rest)])
+
+
+def _widened(array: np.ndarray, out: np.ndarray) -> np.ndarray:
+    """The same numbers in a wider type, in the memory at whose front they lie: from the last to the first."""
+    numbers, wide = array.reshape(-1), out.reshape(-1)
+    step = BLOCK // array.itemsize
+    for last in range(numbers.size, 0, -step):
+        part = slice(max(last - step, 0), last)
+        wide[part] = numbers[part].copy()  # it is written over
+    return out
 
 
 def _tell_rest(path: Path, stream: BinaryIO, count: int) -> None:
@@ -402,17 +427,24 @@ def skip_bytes(path: Path, stream: BinaryIO, count: int) -> None:
 
 
 def read_exactly(
-    path: Path, stream: BinaryIO, count: int, *, allocate: bool, progress: Callable[[float], None] = lambda part: None
+    path: Path,
+    stream: BinaryIO,
+    count: int,
+    *,
+    allocate: bool,
+    progress: Callable[[float], None] = lambda part: None,
+    times: int = 1,
 ) -> bytearray | np.ndarray:
-    """The next `count` bytes. Raises VolumeFileError if there are fewer.
+    """The next `count` bytes, with room behind them for `times` as many in all. Raises VolumeFileError if there are
+    fewer.
 
     A length that was compared with the file's is allocated at once (`allocate`); else memory grows with what is really
     there, so that a header that lies costs no more than the data it has.
     """
     if allocate:
-        whole = np.empty(count, np.uint8)
+        whole = np.empty(times * count, np.uint8)
         done = 0
-        while done < count and (n := stream.readinto(memoryview(whole)[done : done + 64 * BLOCK])):  # type: ignore[attr-defined]
+        while done < count and (n := stream.readinto(memoryview(whole)[done : min(done + 64 * BLOCK, count)])):  # type: ignore[attr-defined]
             done += n
             progress(done / count)
         buffer = whole
@@ -424,12 +456,14 @@ def read_exactly(
         done = len(buffer)
     if done < count:
         raise VolumeFileError(path, f"{count} bytes of samples", f"the end of the data after {done}")
+    if not allocate and times > 1:
+        buffer *= times  # grows where it is
     return buffer
 
 
 def native(buffer: bytearray | np.ndarray, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    """The bytes as an array in native byte order, swapped in place."""
-    array = np.frombuffer(buffer, dtype=dtype)
+    """The first bytes as an array in native byte order, swapped in place."""
+    array = np.frombuffer(buffer, dtype, math.prod(shape))
     if not dtype.isnative:
         array = array.byteswap(inplace=True).view(dtype.newbyteorder("="))
     return array.reshape(shape)

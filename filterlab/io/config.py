@@ -29,7 +29,6 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from filterlab.names import shown, unknown_name
 
 MAX_BYTES = 2**20
-MAX_SIDECAR_BYTES = 2**14  # of a small file beside a volume, which is read before anyone trusts it
 MAX_DEPTH = 32
 MAX_NODES = 100_000
 

@@ -129,20 +129,20 @@ def _in_one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
 
 
 def load_image(path: str | os.PathLike[str], *, srgb: bool = True) -> Tensor:
-    """The image in a file as linear RGB, float32 (H, W, 3) in 0..1; grey is repeated and alpha is left out.
+    """The image in a PNG or JPEG file as linear RGB, float32 (H, W, 3) in 0..1; grey is repeated, alpha left out.
 
     Raises:
         ValueError: no image, or one of more than 2^28 pixels.
         OSError: the file cannot be read.
     """
     try:
-        with Image.open(path, formats=["PNG"]) as picture:
+        with Image.open(path, formats=["PNG", "JPEG"]) as picture:
             if picture.width * picture.height > 2**28:
                 raise ValueError(f"{path}: expected at most {2**28} pixels; got {picture.width} × {picture.height}")
             deep = picture.mode.startswith("I")
             pixels = np.asarray(picture.convert("I") if deep else picture.convert("RGB"))
     except (UnidentifiedImageError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise ValueError(f"{path}: expected a PNG image; got {error}") from None
+        raise ValueError(f"{path}: expected a PNG or JPEG image; got {error}") from None
     encoded = torch.from_numpy(pixels.astype(np.float64) / (65535 if deep else 255))
     encoded = encoded[..., None].expand(-1, -1, 3) if deep else encoded
     return (from_srgb(encoded) if srgb else encoded).to(torch.float32).contiguous()

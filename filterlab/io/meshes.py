@@ -104,6 +104,11 @@ def _read(path: Path) -> Triangles:
     return Triangles(torch.from_numpy(np.array(vertices, np.float64)), faces)
 
 
+def check_trimesh(path: Path) -> None:
+    """Raises ValueError that names the extra to install, if trimesh is missing."""
+    _trimesh(path)
+
+
 def _trimesh(path: Path) -> Callable[..., Any]:
     """The class of trimesh. Raises ValueError that names the extra to install."""
     try:

@@ -49,6 +49,7 @@ _WRITTEN = (
 _UNITS = {"meter": "m", "mm": "mm", "micron": "um"}
 _COLOURS = {128: 3, 2304: 4}  # data types RGB24 and RGBA32: bytes, one per channel
 _LABELS = 1002  # the intent of a volume whose numbers are names
+_OF_NUMBERS = (*range(2, 25), 1001, _LABELS)  # intents of single numbers: statistics, estimates, labels
 
 
 def require_nibabel(path: Path) -> Any:
@@ -130,7 +131,9 @@ def _checked(
         choice,
         stored.held(at),
         lambda: (
-            as_samples(path, stored.read(at), target) if plain else rescaled(stored.read(at), slope, intercept, target)
+            as_samples(path, stored.read(at, target), target)
+            if plain
+            else rescaled(stored.read(at), slope, intercept, target)
         ),
     )
 
@@ -171,8 +174,22 @@ def _place(header: Any, kind: int) -> tuple[np.ndarray, World, str]:
     if sform > 0 and qform > 0:
         qform, other = _other_place(header, affine, qform)
     source = "sform" if sform > 0 else "qform" if qform > 0 else "voxel sizes"
-    nifti = NiftiForms(1 if kind == 348 else 2, max(sform, 0), max(qform, 0), time, other)
+    told = _text(header, "descrip"), *_intent(header)
+    nifti = NiftiForms(1 if kind == 348 else 2, max(sform, 0), max(qform, 0), time, other, *told)
     return affine, World(RAS, _UNITS.get(unit), nifti), source
+
+
+def _text(header: Any, name: str) -> str:
+    return bytes(header[name].tobytes()).split(b"\0")[0].decode("latin-1")
+
+
+def _intent(header: Any) -> tuple[int, tuple[float, float, float], str]:
+    """Code, parameters and name; 0 for what vectors, matrices, … are, of which a volume is one part."""
+    code = int(header["intent_code"])
+    x, y, z = (float(header[f"intent_p{i}"]) for i in (1, 2, 3))
+    if code not in _OF_NUMBERS or not all(map(math.isfinite, (x, y, z))):
+        return 0, (0.0, 0.0, 0.0), ""
+    return code, (x, y, z), _text(header, "intent_name")
 
 
 def _other_place(header: Any, affine: np.ndarray, code: int) -> tuple[int, tuple[tuple[float, ...], ...] | None]:
@@ -205,13 +222,13 @@ def _scaling(path: Path, header: Any) -> tuple[float, float]:
 
 def _fields(header: Any, source: str, slope: float, intercept: float) -> dict[str, str]:
     fields = {
-        "description": bytes(header["descrip"].tobytes()).split(b"\0")[0].decode("latin-1"),
+        "description": _text(header, "descrip"),
         "affine from": source,
     }
     if source == "qform" and header["sform_code"] > 0:
         fields["affine from"] = "qform (the sform is zero)"
-    if int(header["intent_code"]) == _LABELS:
-        fields["intent"] = "labels"
+    if code := int(header["intent_code"]):
+        fields["intent"] = " ".join(("labels" if code == _LABELS else str(code), _text(header, "intent_name"))).strip()
     if (slope, intercept) != (1.0, 0.0):
         fields["scaling"] = f"{slope} · stored + {intercept}"
     return {k: v for k, v in fields.items() if v}
@@ -251,7 +268,8 @@ def write(volume: Volume, path: Path, stored: str | None = None, nifti2: bool = 
     """Writes `.nii` or `.nii.gz`: NIfTI-1, which every tool opens, with the nearest float32 affine.
 
     NIfTI-2, which holds the affine bit for bit, as `version_for` says. A volume that comes from a NIfTI file keeps its
-    codes and units; others have an sform, "aligned". float16 and bfloat16, which the format lacks, become float32.
+    codes, units and description, and the intent of single numbers (labels only where they are integers); others have an
+    sform, "aligned". float16 and bfloat16, which the format lacks, become float32.
     """
     nibabel = require_nibabel(path)
     samples = storable(path, volume, _WRITTEN, stored)
@@ -261,6 +279,7 @@ def write(volume: Volume, path: Path, stored: str | None = None, nifti2: bool = 
     header.set_data_dtype(samples.dtype)
     header.set_zooms(volume.spacing)
     _set_place(header, volume)
+    _set_meaning(header, volume.world.nifti or NiftiForms(), samples.dtype)
     header["magic"] = b"n+1" if first else b"n+2\0\r\n\x1a\n"
     header["vox_offset"] = HEADER_BYTES[348 if first else 540]
     front = io.BytesIO()
@@ -273,6 +292,15 @@ def write(volume: Volume, path: Path, stored: str | None = None, nifti2: bool = 
         stream.write(start)
         for block in samples.blocks():
             stream.write(block.data)
+
+
+def _set_meaning(header: Any, told: NiftiForms, dtype: np.dtype) -> None:
+    """Description and intent."""
+    header["descrip"] = told.description.encode("latin-1")
+    if told.intent and (told.intent != _LABELS or dtype.kind in "iu"):
+        header["intent_code"], header["intent_name"] = told.intent, told.intent_name.encode("latin-1")
+        for i, parameter in enumerate(told.intent_parameters, start=1):
+            header[f"intent_p{i}"] = parameter
 
 
 def _set_place(header: Any, volume: Volume) -> None:

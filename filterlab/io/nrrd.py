@@ -113,7 +113,9 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
         target,
         choice,
         0 if stored is None else stored.held(at),
-        lambda: as_samples(path, itk.read_nrrd(path, size[::-1], dtype) if stored is None else stored.read(at), target),
+        lambda: as_samples(
+            path, itk.read_nrrd(path, size[::-1], dtype) if stored is None else stored.read(at, target), target
+        ),
     )
 
 

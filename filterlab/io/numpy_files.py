@@ -16,14 +16,13 @@ import os
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-from pydantic import Field
 
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import (
@@ -39,17 +38,13 @@ from filterlab.io.bounded import (
     native,
     read_array,
     read_exactly,
-    regular_file,
     sample_dtype,
     scaled,
 )
-from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, dump_config, load_config
 
 if TYPE_CHECKING:
     from filterlab.volume import Volume
 
-Count = Annotated[int, Field(ge=1)]
-Row = tuple[float, float, float, float]
 _GEOMETRY = ("affine", "spacing", "origin")
 _SUFFIX = ".npy"
 MAX_NPY_HEADER = 2**16
@@ -57,18 +52,11 @@ MAX_NPY_TEXT = 1024  # of it, padding aside, which NumPy evaluates as Python: 0.
 MAX_DIRECTORY = 2**18  # bytes; of an entry, 46 and more, zipfile makes an object of 700
 
 
-class GeometrySidecar(StrictModel):
-    """`NAME.npy.yaml`: where the samples of `NAME.npy` lie."""
-
-    size: tuple[Count, Count, Count]
-    affine: tuple[Row, Row, Row, Row]
-
-
 def sidecar_of(path: Path) -> Path:
     return path.with_name(path.name + ".yaml")
 
 
-def _array_header(path: Path, stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+def array_header(path: Path, stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
     """(shape, fortran order, dtype) of the array that begins at the stream's position."""
     start = stream.read(8)
     version = tuple(start[6:])
@@ -100,7 +88,7 @@ def _check_shape(path: Path, shape: tuple[int, ...]) -> tuple[int, ...]:
     return check_size(path, shape)
 
 
-def _stored_order(shape: tuple[int, ...], fortran: bool) -> tuple[int, ...]:
+def stored_order(shape: tuple[int, ...], fortran: bool) -> tuple[int, ...]:
     return shape[::-1] if fortran else shape
 
 
@@ -141,10 +129,10 @@ class Part:
 def read_npy_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
     """The checked header of an .npy file (and of its sidecar). Raises VolumeFileError."""
     with path.open("rb") as file:
-        shape, fortran, dtype = _array_header(path, file)
+        shape, fortran, dtype = array_header(path, file)
         offset = file.tell()
     shape, target = _check_shape(path, shape), sample_dtype(path, dtype)
-    stored = Stored(path, path, "raw", offset, 0, _stored_order(shape, fortran), dtype)
+    stored = Stored(path, path, "raw", offset, 0, stored_order(shape, fortran), dtype)
     stored.check()
     affine, part = _sidecar_affine(path, shape), Part.of(path, shape, fortran, frame, channel)
     return VolumeHeader(
@@ -158,7 +146,7 @@ def read_npy_header(path: Path, frame: int | None = None, channel: int | None = 
         target,
         part.choice,
         stored.held(part.at),
-        lambda: part.samples(path, stored.read(part.at), target),
+        lambda: part.samples(path, stored.read(part.at, target), target),
     )
 
 
@@ -166,10 +154,9 @@ def _sidecar_affine(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     sidecar = sidecar_of(path)
     if not sidecar.exists():
         return np.eye(4)
-    try:
-        found = load_config(regular_file(sidecar), GeometrySidecar, max_bytes=MAX_SIDECAR_BYTES)
-    except ConfigError as error:
-        raise VolumeFileError(sidecar, "the geometry of the samples", str(error)) from None
+    from filterlab.io.sidecars import GeometrySidecar, load_sidecar
+
+    found = load_sidecar(sidecar, GeometrySidecar, "the geometry of the samples")
     if found.size[::-1] != shape[-3:]:
         raise VolumeFileError(sidecar, f"size {list(shape[:-4:-1])} as in {path.name}", f"size {list(found.size)}")
     return np.array(found.affine)
@@ -197,7 +184,7 @@ class _Archive(io.FileIO):
 
 
 @contextmanager
-def _archive(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]]:
+def open_archive(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]]:
     """The archive and its arrays by name; damage anywhere in it becomes VolumeFileError."""
     try:
         with _Archive(path) as file, zipfile.ZipFile(file) as archive:
@@ -211,7 +198,7 @@ def _archive(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile.Zi
         raise VolumeFileError(path, "an intact npz archive", f"{type(error).__name__}: {error}"[:200]) from None
 
 
-def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> BinaryIO:
+def open_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> BinaryIO:
     """An open member whose claimed sizes are plausible."""
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise VolumeFileError(path, f"{info.filename} stored or deflated", f"zip method {info.compress_type}")
@@ -226,11 +213,11 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Bina
 
 def read_npz_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
     """The checked header of an .npz file. Raises VolumeFileError."""
-    with _archive(path) as (archive, members):
+    with open_archive(path) as (archive, members):
         name = _samples_name(path, members)
         info = members[name]
-        with _member(path, archive, info) as stream:
-            shape, fortran, dtype = _array_header(path, stream)
+        with open_member(path, archive, info) as stream:
+            shape, fortran, dtype = array_header(path, stream)
             offset = stream.tell()
         shape, target = _check_shape(path, shape), sample_dtype(path, dtype)
         claimed = math.prod(shape) * dtype.itemsize
@@ -241,9 +228,9 @@ def read_npz_header(path: Path, frame: int | None = None, channel: int | None = 
     part = Part.of(path, shape, fortran, frame, channel)
 
     def read() -> np.ndarray:
-        with _archive(path) as (archive, _), _member(path, archive, info) as stream:
+        with open_archive(path) as (archive, _), open_member(path, archive, info) as stream:
             stream.read(offset)
-            array = read_array(path, stream, _stored_order(shape, fortran), dtype, part.at, raw=False)
+            array = read_array(path, stream, stored_order(shape, fortran), dtype, part.at, raw=False, target=target)
         return part.samples(path, array, target)
 
     return VolumeHeader(
@@ -270,17 +257,14 @@ def _samples_name(path: Path, members: dict[str, Any]) -> str:
     return others[0]
 
 
+def small_numbers(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, shape: tuple[int, ...]) -> np.ndarray:
+    """The few numbers of that shape in a member, float64. Raises VolumeFileError."""
+    return _numbers(path, archive, info, shape).astype(np.float64)
+
+
 def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]) -> np.ndarray:
     def small(name: str, shape: tuple[int, ...], default: np.ndarray) -> np.ndarray:
-        if name not in members:
-            return default
-        with _member(path, archive, members[name]) as stream:
-            found, fortran, dtype = _array_header(path, stream)
-            if found != shape or dtype.kind not in "fiu" or dtype.itemsize > 8:
-                raise VolumeFileError(path, f"numbers of shape {shape} as {name}", f"{dtype} of shape {found}"[:100])
-            buffer = read_exactly(path, stream, math.prod(shape) * dtype.itemsize, allocate=False)
-        array = native(buffer, dtype, _stored_order(shape, fortran)).astype(np.float64)
-        return array.T if fortran else array
+        return small_numbers(path, archive, members[name], shape) if name in members else default
 
     if "affine" in members:
         if "spacing" in members or "origin" in members:
@@ -290,6 +274,33 @@ def _npz_affine(path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile
     if not (spacing > 0).all():
         raise VolumeFileError(path, "a positive spacing", spacing.tolist())
     return scaled(spacing.tolist(), small("origin", (3,), np.zeros(3)).tolist())
+
+
+def _numbers(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, shape: tuple[int | None, ...]) -> np.ndarray:
+    """A member of numbers, of a shape in which None is any length, in its own type and native byte order."""
+    with open_member(path, archive, info) as stream:
+        found, fortran, dtype = array_header(path, stream)
+        fits = len(found) == len(shape) and all(n in (None, own) for n, own in zip(shape, found, strict=True))
+        if not fits or dtype.kind not in "fiu" or dtype.itemsize > 8:
+            name = info.filename.removesuffix(_SUFFIX)
+            wanted = str(shape).replace("None", "…")
+            raise VolumeFileError(path, f"numbers of shape {wanted} as {name}", f"{dtype} of shape {found}"[:100])
+        buffer = read_exactly(path, stream, math.prod(found) * dtype.itemsize, allocate=False)
+    array = native(buffer, dtype, stored_order(found, fortran))
+    return np.ascontiguousarray(array.T) if fortran else array
+
+
+def read_arrays(path: Path, shapes: Mapping[str, tuple[int | None, ...]]) -> dict[str, np.ndarray]:
+    """Those arrays of an .npz file that it has, by name; None in a shape is any length. Raises VolumeFileError."""
+    with open_archive(path) as (archive, members):
+        own = {name: members[name] for name in shapes if name in members}
+        return {name: _numbers(path, archive, info, shapes[name]) for name, info in own.items()}
+
+
+def names_of_arrays(path: Path) -> frozenset[str]:
+    """Of an .npz file. Raises VolumeFileError."""
+    with open_archive(path) as (_, members):
+        return frozenset(members)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -339,13 +350,21 @@ def _described(volume: Volume) -> str | None:
     """The text of a sidecar; None: voxel centres are the integers, and none is needed."""
     if volume.geometry.is_identity:
         return None
+    from filterlab.io.config import dump_config
+    from filterlab.io.sidecars import GeometrySidecar
+
     affine = tuple(map(tuple, volume.affine.tolist()))
     return dump_config(GeometrySidecar(size=volume.size, affine=affine))  # type: ignore[arg-type]
 
 
 def write_npz(volume: Volume, path: Path, stored: str | None = None) -> None:
     """Writes `samples` and `affine`, compressed; bfloat16 becomes float32."""
+    write_arrays(path, {"samples": _samples(path, volume, stored), "affine": volume.affine})
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray | Outgoing]) -> None:
+    """Writes arrays by name, compressed."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-        for name, data in (("samples", _samples(path, volume, stored)), ("affine", volume.affine)):
+        for name, data in arrays.items():
             with archive.open(name + _SUFFIX, "w", force_zip64=True) as stream:
                 write_array(stream, data)  # type: ignore[arg-type]

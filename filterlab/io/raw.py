@@ -13,13 +13,11 @@ affine: [[…], …]          # 4×4, instead of spacing and origin
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from filterlab.io.bounded import (
-    SAMPLE_TYPES,
     Choice,
     Stored,
     VolumeFileError,
@@ -28,39 +26,19 @@ from filterlab.io.bounded import (
     beside,
     check_geometry,
     check_size,
-    regular_file,
     sample_dtype,
     scaled,
 )
-from filterlab.io.config import MAX_SIDECAR_BYTES, ConfigError, StrictModel, load_config
-from filterlab.names import unknown_name
 
-Count = Annotated[int, Field(ge=1)]
-Positive = Annotated[float, Field(gt=0)]
-Row = tuple[float, float, float, float]
+if TYPE_CHECKING:
+    from filterlab.io.sidecars import RawSidecar
 
 
-class RawSidecar(StrictModel):
-    """What a sidecar says; see the head of this file."""
+def read_sidecar(path: Path) -> RawSidecar:
+    """The checked sidecar. Raises VolumeFileError."""
+    from filterlab.io.sidecars import RawSidecar, load_sidecar
 
-    size: tuple[Count, Count, Count]
-    dtype: str
-    file: str | None = None
-    byte_order: Literal["little", "big"] | None = None
-    offset: Annotated[int, Field(ge=0, lt=2**62)] = 0
-    spacing: tuple[Positive, Positive, Positive] | None = None
-    origin: tuple[float, float, float] | None = None
-    affine: tuple[Row, Row, Row, Row] | None = None
-
-    @model_validator(mode="after")
-    def _consistent(self) -> RawSidecar:
-        if self.dtype not in SAMPLE_TYPES:
-            raise ValueError(unknown_name("dtype", self.dtype, SAMPLE_TYPES))
-        if np.dtype(self.dtype).itemsize > 1 and self.byte_order is None:
-            raise ValueError(f"expected byte_order: little or big, for {self.dtype}; it is missing")
-        if self.affine is not None and (self.spacing is not None or self.origin is not None):
-            raise ValueError("expected an affine, or spacing and origin; got both")
-        return self
+    return load_sidecar(path, RawSidecar, "a description of raw samples")
 
 
 def read_header(path: Path, frame: int | None = None, channel: int | None = None) -> VolumeHeader:
@@ -68,10 +46,7 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
     sidecar = path if path.name.lower().endswith(".yaml") else path.with_name(path.name + ".yaml")
     if not sidecar.exists():
         raise VolumeFileError(path, f"a sidecar {sidecar.name} with size, dtype, …", "no such file")
-    try:
-        found = load_config(regular_file(sidecar), RawSidecar, max_bytes=MAX_SIDECAR_BYTES)
-    except ConfigError as error:
-        raise VolumeFileError(sidecar, "a description of raw samples", str(error)) from None
+    found = read_sidecar(sidecar)
     if sidecar != path and found.file not in (None, path.name):
         raise VolumeFileError(sidecar, f"file: {path.name}", found.file)
     data = beside(sidecar, found.file or sidecar.name[: -len(".yaml")])
@@ -93,5 +68,5 @@ def read_header(path: Path, frame: int | None = None, channel: int | None = None
         target,
         Choice.of(path, 1, 1, frame, channel),
         0,
-        lambda: as_samples(path, stored.read(), target),
+        lambda: as_samples(path, stored.read((), target), target),
     )

@@ -508,3 +508,15 @@ class TiffFile:
         ):
             expected = f"pages of {self._claimed} bytes from its {self.length} bytes"
             raise VolumeFileError(self.path, expected, f"strips or tiles of {self._read}, {self._stored} in the file")
+
+
+def is_map(path: Path) -> bool:
+    """Whether the first page has the tags of a map, or is the only one and has one value per pixel.
+
+    Raises VolumeFileError for what is no TIFF file.
+    """
+    with path.open("rb") as stream:
+        first = next(iter(TiffFile(path, stream)), None)
+        if first is None:
+            return False
+        return bool(_GEOGRAPHY & first.tags.keys()) or (first.last and first.number(SAMPLES_PER_PIXEL, 1) == 1)

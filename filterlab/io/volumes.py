@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 from filterlab.io import itk, nifti, nrrd, numpy_files, raw, tiff
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import VolumeFileError, VolumeHeader, beside, regular_file
-from filterlab.io.config import MAX_SIDECAR_BYTES, load_config
 from filterlab.names import unknown_name
 
 if TYPE_CHECKING:
@@ -120,7 +119,7 @@ def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:
     elif name == "raw":
         describe(path)
         sidecar = path if path.name.lower().endswith(".yaml") else path.with_name(path.name + ".yaml")
-        data = load_config(sidecar, raw.RawSidecar, max_bytes=MAX_SIDECAR_BYTES).file or sidecar.name[: -len(".yaml")]
+        data = raw.read_sidecar(sidecar).file or sidecar.name[: -len(".yaml")]
         found = [sidecar, beside(sidecar, data)]
     return tuple(file.resolve() for file in found)
 

@@ -3,6 +3,7 @@
     stencil ──▶ gather place prefilter contract march raycast bounds ─▶ reference ─▶ cpu, cuda ─▶ differentiable ─▶ here
     what is summed    descriptions of every op              plain twins    programs     choice, adjoint
     tree    ──▶ quadrics
+    masks   ──▶ heights (jet, splat) ─▶ height_hits
 
 Every op has the same five parts in the same places: what it is (`<op>`: frozen data, shapes, limits), the plain twin
 (`reference`), vector code (`cpu`), code for a GPU (`cuda`), and what makes it differentiable and chooses
@@ -24,7 +25,6 @@ from filterlab.ops.differentiable import place as placement
 from filterlab.ops.differentiable import prefilter as filtering
 from filterlab.ops.differentiable.evaluation import Evaluation
 from filterlab.ops.differentiable.gather import IMPLEMENTATIONS
-from filterlab.ops.differentiable.prefilter import prefilter_axis
 from filterlab.ops.place import Placed, Placement
 from filterlab.ops.stencil import Product, Stencil, multi_indices
 from filterlab.ops.tetrahedra import AnyStencil, TetrahedralStencil
@@ -141,6 +141,21 @@ def place(points: Tensor, where: Placement, implementation: str = "reference") -
     if torch.compiler.is_compiling():
         return operators.place(points, operators.placement_text(where), implementation)
     return placement.place(points, where, implementation)
+
+
+def prefilter_axis(
+    samples: Tensor,
+    dim: int,
+    prefilter: str | Prefilter,
+    boundary: str | Boundary = Boundary.MIRROR,
+    tail: int = 0,
+    implementation: str = "reference",
+) -> Tensor:
+    """Coefficients along one axis; see `ops.differentiable.prefilter.prefilter_axis`."""
+    if torch.compiler.is_compiling() and implementation != "reference":
+        text = operators.filtering_text(prefilter, boundary, tail, (dim % samples.ndim - samples.ndim,))
+        return operators.prefilter(samples, text, implementation)
+    return filtering.prefilter_axis(samples, dim, prefilter, boundary, tail, implementation)
 
 
 def prefilter_samples(

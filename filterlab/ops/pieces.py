@@ -119,7 +119,7 @@ class Lattice:
     @cached_property
     def continuous(self) -> bool:
         """Whether polynomials of neighbouring cells agree where they meet."""
-        return all(_continuous(k) for p in self.row for k in p.kernels)
+        return all(_continuous(k) for p in self.row for k, n in zip(p.kernels, self.cells, strict=True) if n > 1)
 
 
 def _continuous(kernel: PiecewisePolynomial) -> bool:

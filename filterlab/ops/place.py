@@ -33,11 +33,11 @@ class Placement:
         boundary: the extension of the samples.
         size: voxels along x, y, z.
         tail: how far beyond the ends points are told apart (border and zeros).
-        shift: what is subtracted in the end: ½ for coefficients at half-integers.
+        shift: what is subtracted in the end along x, y, z: ½ for coefficients at half-integers.
     """
 
     geometry: Geometry
     boundary: Boundary
     size: tuple[int, int, int]
     tail: int = 0
-    shift: float = 0.0
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)

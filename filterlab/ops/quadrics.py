@@ -12,8 +12,9 @@ and β² − αγ loses no digits to the distance of the eye. The ball is |ρ| �
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -34,19 +35,40 @@ PLANES = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Quadrics:
-    """M quadrics in balls cut by planes.
+class InLeaves:
+    """M surfaces in the leaves of a tree, all of one kind.
 
     Attributes:
+        op: what finds hits of that kind.
         tree: where they are; leaves have eight places.
-        leaves: (G, 16 + 4 H, 8) float64, for every place: A, b, c; the ball's centre from the tree's, r²; |A|, |b|;
-            n, d of H planes n·q + d ≤ 0. Of places without a quadric NaN.
+        leaves: (G, K, 8) float64, for every place K numbers; of places without a surface NaN.
         faces: of which hits there are: "front", where F goes from + to − along the ray, "back" or "both".
     """
 
+    op: ClassVar[str]
     tree: Tree
     leaves: Tensor
     faces: str = "both"
+
+    def some(self, kept: Tensor) -> Self:
+        """Those of a mask (M,); they keep their numbers, and hits with them every bit."""
+        rows = self.leaves.transpose(1, 2).flatten(0, 1)[: len(self.tree.order)]
+        return type(self)(self.tree.some(kept), in_leaves(rows[kept[self.tree.order]], torch.nan), self.faces)
+
+    def kept(self, reversed: bool) -> Kept:
+        """Which hits count of rays that go as directions say, or the other way round."""
+        falls, rises = self.faces != "back", self.faces != "front"
+        return Kept(*((rises, falls) if reversed else (falls, rises)), falls)
+
+
+@dataclass(frozen=True, eq=False)
+class Quadrics(InLeaves):
+    """M quadrics in balls cut by planes.
+
+    Leaves have 16 + 4 H rows: A, b, c; the ball's centre from the tree's, r²; |A|, |b|; n, d of H planes n·q + d ≤ 0.
+    """
+
+    op = "quadrics"
 
     @classmethod
     def of(
@@ -67,20 +89,10 @@ class Quadrics:
         rows = torch.cat((entries, vector, constant[:, None], ball, sizes, planes.flatten(1)), 1)
         return cls(tree, in_leaves(rows[order], torch.nan), faces)
 
-    def some(self, kept: Tensor) -> Quadrics:
-        """Those of a mask (M,); they keep their numbers, and hits with them every bit."""
-        rows = self.leaves.transpose(1, 2).flatten(0, 1)[: len(self.tree.order)]
-        return Quadrics(self.tree.some(kept), in_leaves(rows[kept[self.tree.order]], torch.nan), self.faces)
-
     @property
     def planes(self) -> int:
         """H."""
         return (self.leaves.shape[1] - PLANES) // 4
-
-    def kept(self, reversed: bool) -> Kept:
-        """Which hits count of rays that go as directions say, or the other way round."""
-        falls, rises = self.faces != "back", self.faces != "front"
-        return Kept(*((rises, falls) if reversed else (falls, rises)), falls)
 
 
 class Kept(NamedTuple):
@@ -118,11 +130,11 @@ class Rays:
         o, d = origins.double() - tree.center, directions.double()
         largest = d.abs().amax(1, keepdim=True)
         d = d / largest  # neither huge nor tiny ones leave the range of their squares
-        norm = (d * d).sum(1, keepdim=True).sqrt()
+        norm = torch.linalg.vector_norm(d, dim=1, keepdim=True)
         u = d / norm
-        behind = (o * u).sum(1, keepdim=True)
-        start, eye = o - behind * u, behind[:, 0]
-        nearest = (start * start).sum(1)
+        eye = _dot(o, u)
+        start = o - eye[:, None] * u
+        nearest = _dot(start, start)
         misses = nearest > (tree.radius * (1 + 1e-9)) ** 2
         first = eye - 4 * torch.finfo(torch.float64).eps * (eye.abs() + tree.radius)
         last = torch.where(misses, -torch.inf, torch.inf).to(first)
@@ -134,3 +146,16 @@ class Rays:
         """(R, k) in units of the directions as they were given; ∞ stays."""
         way = self.eye[:, None] - tau if self.reversed else tau - self.eye[:, None]
         return torch.where(tau < torch.inf, (way / self.length[:, None]).clamp_min(0), torch.inf)
+
+
+def in_parts(
+    cast: Callable[[Tensor, Tensor], Sequence[Tensor]], origins: Tensor, directions: Tensor, most: int
+) -> Sequence[Tensor]:
+    """What `cast` gives of rays (R, 3), at most so many at a time, joined."""
+    found = [cast(*rays) for rays in zip(origins.split(most), directions.split(most), strict=True)]
+    return [torch.cat(rows) for rows in zip(*found, strict=True)]
+
+
+def _dot(x: Tensor, y: Tensor) -> Tensor:
+    """Of vectors (R, 3); a sum over so short an axis takes torch twice as long."""
+    return x[:, 0] * y[:, 0] + x[:, 1] * y[:, 1] + x[:, 2] * y[:, 2]

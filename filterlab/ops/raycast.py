@@ -76,13 +76,12 @@ class Written(NamedTuple):
     flags: Tensor
 
     @classmethod
-    def room(cls, given: Raycast, rays: int, capacity: int) -> Written:
-        """To be written."""
-        device, numbers = given.lattice.coefficients.device, given.lattice.degree + 1
+    def room(cls, rays: int, capacity: int, degree: int, dtype: torch.dtype, device: torch.device) -> Written:
+        """To be written, of polynomials of a degree and type."""
         return cls(
             torch.zeros(rays, dtype=torch.int64, device=device),
             torch.empty(rays, capacity, 3, dtype=torch.float64, device=device),
-            torch.empty(rays, capacity, numbers, dtype=given.dtype, device=device),
+            torch.empty(rays, capacity, degree + 1, dtype=dtype, device=device),
             torch.empty(rays, capacity, dtype=torch.uint8, device=device),
         )
 
@@ -95,17 +94,19 @@ class Written(NamedTuple):
         return Candidates(ray, start, near, far, self.pieces[here], (flags & JUMP) > 0, (flags & REPEATED) > 0)
 
 
-def written_in_parts(write: Callable[[Tensor, int], Written], given: Raycast, rays: int) -> Candidates:
+def written_in_parts(
+    write: Callable[[Tensor, int], Written], degree: int, rays: int, device: torch.device
+) -> Candidates:
     """All candidates of so many rays, a part of them at a time; rays that have more than there was room for come later.
 
     Args:
         write: of rays, by their numbers, with room for so many candidates each.
     """
     parts, capacity = [], _FEW
-    left = torch.arange(rays, device=given.lattice.coefficients.device)
+    left = torch.arange(rays, device=device)
     while len(left) or not parts:
         again = []
-        for own in left.split(max(1, _NUMBERS_AT_ONCE // (capacity * (given.lattice.degree + 4)))):
+        for own in left.split(max(1, _NUMBERS_AT_ONCE // (capacity * (degree + 4)))):
             written = write(own, capacity)
             parts.append(written.candidates(own))
             again.append(own[written.count > capacity])

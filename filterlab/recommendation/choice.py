@@ -92,12 +92,14 @@ class Recommendation(Question):
         candidates: all, the cheapest first.
         pick: the cheapest within the budget; None: there is none.
         best: the one with the least error, whatever it costs.
+        of_value: the least error of the value alone, as task "resample" counts it.
     """
 
     value_range: tuple[float, float]
     candidates: tuple[Candidate, ...]
     pick: Candidate | None
     best: Candidate
+    of_value: ErrorEstimate
 
     @property
     def chosen(self) -> Candidate:
@@ -219,13 +221,14 @@ def choose(
     ]
     candidates.sort(key=lambda c: (c.seconds, c.memory))
     most_accurate = sorted(candidates, key=lambda c: (c.error.high, c.seconds))
-    builds = partial(_builds, question, volume)
+    builds, of_values = partial(_builds, question, volume), [yardstick.estimate("resample", e) for e in errors.values()]
     return Recommendation(
         **vars(question),
         value_range=yardstick.value_range,
         candidates=tuple(candidates),
         pick=next(filter(builds, filter(question.fits, candidates)), None),
         best=next(filter(builds, most_accurate)),
+        of_value=min(of_values, key=lambda error: error.high),
     )
 
 

@@ -41,7 +41,27 @@ def sentences(found: Recommendation) -> list[str]:
     else:
         lines.append(f"Nothing surely meets the budget: {_why_not(found)}")
         lines.append(f"The most accurate: {_named(chosen)}, {_interval(chosen)}.")
+        if chosen.error.high > found.max_error:
+            lines.append(f"What would help: {_help(found)}.")
     return lines
+
+
+def _help(found: Recommendation) -> str:
+    """Which budget would be met, and what to change for a smaller one."""
+    ways = [f"a budget of {_percent_above(found.best.error.high)}, which that one keeps"]
+    if found.task != "resample" and found.of_value.high <= found.max_error:
+        ways.append(
+            "to count the value alone, as task resample does: the gradient is what is off, the value is within "
+            f"{_percent_above(found.of_value.high)}"
+        )
+    if found.best.resolved:
+        ways.append("finer voxels")
+    else:
+        ways.append(
+            "finer voxels, or a volume that its voxels resolve: smoothed, or onto a coarser grid by antialias=True "
+            "(another signal, without the finest detail)"
+        )
+    return "; ".join(ways)
 
 
 def _why_not(found: Recommendation) -> str:
@@ -109,6 +129,12 @@ def percent(part: float) -> str:
     return f"{100 * part:.3g} %"
 
 
+def _percent_above(part: float) -> str:
+    """Rounded up: what is within the number is within this."""
+    digits = 2 - math.floor(math.log10(100 * part)) if part > 0 else 0
+    return f"{math.ceil(100 * part * 10**digits * (1 - 1e-12)) / 10**digits:.3g} %"
+
+
 def duration(seconds: float) -> str:
     """Seconds in the unit that reads best."""
     for unit, factor in (("s", 1.0), ("ms", 1e3)):
@@ -154,6 +180,7 @@ def data(found: Recommendation) -> dict[str, Any]:
         "pick": plain(found.pick),
         "undecided": found.undecided,
         "best": plain(found.best),
+        "value_error": {name: _finite(number) for name, number in asdict(found.of_value).items()},
         "runners_up": [plain(c) for c in found.runners_up()],
     }
 

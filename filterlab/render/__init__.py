@@ -5,15 +5,26 @@ from filterlab.render.colormaps import ColorScale
 from filterlab.render.dvr import render
 from filterlab.render.materials import Environment, Material, Phong, ReflectionLines, Toon
 from filterlab.render.raycast import raycast
+from filterlab.render.relief import ByAspect, ByHeight, ByNormal, BySlope, Draped, Hillshade, Lambertian, Unlit
+from filterlab.render.scenery import Block, Haze, Sky, Water, sun
 from filterlab.render.shading import Light, Shading
 from filterlab.render.silhouettes import Silhouettes
 from filterlab.render.transfer import TransferFunction
 from filterlab.render.values import Plane, colored, maximum_projection, plane_values
 
 __all__ = [
+    "Block",
+    "ByAspect",
+    "ByHeight",
+    "ByNormal",
+    "BySlope",
     "Camera",
     "ColorScale",
+    "Draped",
     "Environment",
+    "Haze",
+    "Hillshade",
+    "Lambertian",
     "Light",
     "Material",
     "OrthographicCamera",
@@ -23,11 +34,15 @@ __all__ = [
     "ReflectionLines",
     "Shading",
     "Silhouettes",
+    "Sky",
     "Toon",
     "TransferFunction",
+    "Unlit",
+    "Water",
     "colored",
     "maximum_projection",
     "plane_values",
     "raycast",
     "render",
+    "sun",
 ]

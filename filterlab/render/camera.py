@@ -16,7 +16,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, as_numbers
 from filterlab.fields.base import Domain, Field
 from filterlab.geometry import times_matrix
 from filterlab.ops.reference.optics import Table
@@ -178,6 +178,7 @@ class PerspectiveCamera(Camera):
         field_of_view: float = 25.0,
         aspect: float = 1.0,
         margin: float = 1.05,
+        samples: suggestion.Sampled | None = None,
     ) -> Self:
         """The camera with all that is seen of a field in view, as near as it can be, and in the middle.
 
@@ -187,16 +188,35 @@ class PerspectiveCamera(Camera):
             direction: the world direction in which the camera looks; None: along no axis, somewhat downwards, and of
                 anatomical coordinates from the front.
             up, field_of_view, aspect, margin: as in `framing`.
+            samples: as for `TransferFunction.suggested`.
 
         Raises:
             ValueError: as `framing` and `TransferFunction.suggested`.
         """
-        given = suggestion.sampled(field)
+        given = samples or suggestion.sampled(field)
         table = Table(*suggestion.tables(given), 1.0) if transfer is None else transfer.to(torch.float64, "cpu")
         value = given.values.nan_to_num(float(table.positions.detach()[0]))
         opacity = table.opacity(table.locate(value)).detach().masked_fill(given.values.isnan(), 0)
         points = suggestion.seen(given, opacity)
         direction = suggestion.direction_for(field) if direction is None else direction
+        return cls.of_points(points, direction, up=up, field_of_view=field_of_view, aspect=aspect, margin=margin)
+
+    @classmethod
+    def of_points(
+        cls,
+        points: Array,
+        direction: Vector,
+        *,
+        up: Vector = (0.0, 0.0, 1.0),
+        field_of_view: float = 25.0,
+        aspect: float = 1.0,
+        margin: float = 1.05,
+    ) -> Self:
+        """The camera with world points (M, 3) in view, as near as it can be, and them in the middle.
+
+        Raises ValueError as `framing`.
+        """
+        points = _vector(points).cpu()
         seen = _Seen.of(points, direction, up, aspect, margin).centered(_half_height(field_of_view))
         return cls._of(seen, up, field_of_view)
 
@@ -269,7 +289,7 @@ def check_size(size: Sequence[int]) -> tuple[int, int]:
 
 
 def _vector(value: Vector | float, device: torch.device | None = None) -> Tensor:
-    return torch.as_tensor(as_tensor(value), dtype=torch.float64, device=device)
+    return as_numbers(value, device=device)
 
 
 def _number(expected: str, value: float | Tensor) -> float:

@@ -1,6 +1,7 @@
 """Colormaps by name, and the scales that give values their colours.
 
-Names and entries are matplotlib's. They are colours of a screen, encoded by sRGB; computed is with linear light.
+Names and entries are matplotlib's, but for `hypsometric`. They are colours of a screen, encoded by sRGB; computed is
+with linear light.
 """
 
 from __future__ import annotations
@@ -13,18 +14,23 @@ from torch import Tensor
 from filterlab.io.images import from_srgb
 from filterlab.names import unknown_name
 
-GRAY = "gray"
+GRAY, HYPSOMETRIC = "gray", "hypsometric"
+_TINTS = (
+    *("#5e8f62", "#7ba869", "#9bbd75", "#bccd86", "#d8d597", "#e6d49b", "#dfc08a", "#cda673", "#b98f64", "#a67f5f"),
+    *("#9b7b66", "#a28b7f", "#b3a59e", "#c9c1bd", "#dfdbd9", "#f1f0ef", "#ffffff"),
+)
+"""Tints of an atlas at equal steps of height: meadows, dry land, rock, snow."""
 _WELL_KNOWN = ("viridis", "magma", "inferno", "plasma", "cividis", "turbo", "gray", "bone", "hot", "coolwarm", "RdBu")
 
 
 def check_colormap(name: str) -> str:
-    """The name. Raises ValueError unless matplotlib has a colormap of it."""
-    if name != GRAY:  # which needs no matplotlib
+    """The name. Raises ValueError unless there is a colormap of it."""
+    if name not in (GRAY, HYPSOMETRIC):  # which need no matplotlib
         from matplotlib import colormaps
 
         if name not in colormaps:
             close = unknown_name("colormap", name, colormaps).partition("known colormaps")[0]
-            raise ValueError(f"{close}known colormaps: those of matplotlib, as {', '.join(_WELL_KNOWN)}")
+            raise ValueError(f"{close}known colormaps: {HYPSOMETRIC}, those of matplotlib, as {', '.join(_WELL_KNOWN)}")
     return name
 
 
@@ -32,6 +38,8 @@ def encoded_entries(name: str) -> Tensor:
     """A colormap's own entries, first to last, encoded by sRGB, `(N, 3)` float64. Raises as `check_colormap`."""
     if check_colormap(name) == GRAY:
         return torch.tensor([[0.0] * 3, [1.0] * 3], dtype=torch.float64)
+    if name == HYPSOMETRIC:
+        return torch.tensor([list(bytes.fromhex(tint[1:])) for tint in _TINTS], dtype=torch.float64) / 255
     from matplotlib import colormaps
 
     colormap = colormaps[name]
@@ -49,7 +57,7 @@ class ColorScale:
 
     Attributes:
         low, high: the values at both ends; where they are equal, as in a constant volume, every value is the first.
-        colormap: a name of matplotlib's.
+        colormap: a name of matplotlib's, or `hypsometric`.
 
     Raises:
         ValueError: no such colormap, or ends that do not increase.

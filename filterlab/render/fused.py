@@ -118,7 +118,7 @@ class EmptyBricks:
 
     def empty(self, points: Tensor) -> Tensor:
         """Whether each point `(S, 3)` within the domain lies in an empty brick."""
-        located = self.field.domain.geometry.to_voxel(points) - self.field.coefficients.shift
+        located = self.field.domain.geometry.to_voxel(points) - points.new_tensor(self.field.coefficients.shift)
         first = located - located.new_tensor([s / 2 - 1 for s in self.supports])
         sizes = torch.tensor(self.bricks.distance.shape[::-1], device=points.device)
         brick = (first.floor().long() - self.field.coefficients.start) >> self.bricks.edge
@@ -192,7 +192,7 @@ def _prepared(medium: Medium, chords: Chords, empty: Bricks | None) -> March:
 def _in_the_grid(field: GridField, chords: Chords) -> Chords:
     """Chords in coordinates of the coefficients. They lie within the domain: no boundary folds them."""
     geometry = field.domain.geometry
-    entry = geometry.to_voxel(chords.entry) - field.coefficients.shift
+    entry = geometry.to_voxel(chords.entry) - chords.entry.new_tensor(field.coefficients.shift)
     return Chords(entry, geometry.direction_to_voxel(chords.direction), chords.length, chords.offset, chords.count)
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, as_numbers, as_tensor
 from filterlab.fields.base import Field
 from filterlab.ops.reference.optics import absorbed
 from filterlab.render.camera import Camera, check_size
@@ -134,7 +134,7 @@ def _one_by_one(device: torch.device) -> Callable[[range], Tensor]:
 def check_background(background: Sequence[float] | Tensor, device: torch.device) -> Tensor:
     """Linear RGB (3,) float64. Raises ValueError unless it is three finite numbers ≥ 0."""
     try:
-        color = torch.as_tensor(as_tensor(background), dtype=torch.float64, device=device)
+        color = as_numbers(background, device=device)
     except (TypeError, ValueError, ArithmeticError, RuntimeError):
         color = torch.empty(0)
     if color.shape != (3,) or not color.detach().isfinite().all() or (color.detach() < 0).any():

@@ -15,10 +15,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, as_numbers, as_tensor
 from filterlab.fields.base import Field
 from filterlab.ops.reference.optics import dot, safe_normalize
-from filterlab.render.shading import Light, Shading
+from filterlab.render.scenery import Sky
+from filterlab.render.shading import Light, Shading, like
 from filterlab.render.transfer import TransferFunction
 
 Color = Sequence[float] | Array
@@ -51,31 +52,48 @@ class Seen(NamedTuple):
 # --- the colour of a surface ------------------------------------------------------------------------------------------
 
 
+class Coloring(ABC):
+    """What gives every point of a surface a colour.
+
+    Attributes:
+        order: derivatives of the surface that it needs: 1 normals, 2 curvatures.
+    """
+
+    order: int = 1
+
+    @abstractmethod
+    def __call__(self, seen: Seen) -> Tensor:
+        """Linear RGB (R, 3)."""
+
+    @staticmethod
+    def of(color: Color | Coloring) -> Coloring:
+        """A colouring as it is, one colour as `Uniform`."""
+        return color if isinstance(color, Coloring) else Uniform(color)
+
+
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(Coloring):
     """One colour everywhere."""
 
     color: Color = (0.8, 0.8, 0.8)
-    order = 1
 
     def __call__(self, seen: Seen) -> Tensor:
-        return _like(self.color, seen.point).expand_as(seen.point)
+        return like(self.color, seen.point).expand_as(seen.point)
 
 
 @dataclass(frozen=True)
-class ByField:
+class ByField(Coloring):
     """The colours that a transfer function gives the values of another field: an error, a second modality."""
 
     field: Field
     transfer: TransferFunction
-    order = 1
 
     def __call__(self, seen: Seen) -> Tensor:
         return _mapped(self.transfer, self.field(seen.point))
 
 
 @dataclass(frozen=True)
-class ByCurvature:
+class ByCurvature(Coloring):
     """The colours that a transfer function gives curvatures.
 
     Attributes:
@@ -103,7 +121,7 @@ _CURVATURES: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 @dataclass(frozen=True)
-class Triplanar:
+class Triplanar(Coloring):
     """A texture (H, W, 3) projected along x, y and z, blended by the squares of the normal's components.
 
     Attributes:
@@ -112,10 +130,9 @@ class Triplanar:
 
     texture: Array
     size: float = 1.0
-    order = 1
 
     def __post_init__(self) -> None:
-        _check_picture("texture", self.texture)
+        check_picture("texture", self.texture)
         if not 0 < self.size < math.inf:
             raise ValueError(f"size must be a positive world length; got {self.size!r}")
 
@@ -124,11 +141,8 @@ class Triplanar:
         tiles = seen.point / self.size
         color = torch.zeros_like(seen.point)
         for axis, (u, v) in enumerate(((1, 2), (0, 2), (0, 1))):
-            color = color + weights[:, axis, None] * _looked_up(self.texture, tiles[:, u], tiles[:, v], wrapped=True)
+            color = color + weights[:, axis, None] * looked_up(self.texture, tiles[:, u], tiles[:, v], (True, True))
         return color
-
-
-Coloring = Uniform | ByField | ByCurvature | Triplanar
 
 
 def _mapped(transfer: TransferFunction, value: Tensor) -> Tensor:
@@ -174,16 +188,16 @@ class Phong(Material):
     opacity: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_opacity(self.opacity)
+        check_opacity(self.opacity)
         self._shading(())
 
     @property
     def order(self) -> int:
-        return _coloring(self.color).order
+        return Coloring.of(self.color).order
 
     def __call__(self, seen: Seen, lights: Sequence[Light]) -> Tensor:
         shadows = [seen.visibility(light) for light in lights]
-        return self._shading(lights)(_coloring(self.color)(seen), seen.normal, seen.direction, shadows)
+        return self._shading(lights)(Coloring.of(self.color)(seen), seen.normal, seen.direction, shadows)
 
     def _shading(self, lights: Sequence[Light]) -> Shading:
         return Shading(tuple(lights), self.ambient, self.diffuse, self.specular, self.shininess)
@@ -206,7 +220,7 @@ class ReflectionLines(Material):
     opacity: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_opacity(self.opacity)
+        check_opacity(self.opacity)
         _check_direction("axis", self.axis)
 
     @property
@@ -215,11 +229,11 @@ class ReflectionLines(Material):
 
     def __call__(self, seen: Seen, lights: Sequence[Light]) -> Tensor:
         r = seen.reflected
-        axis = safe_normalize(_like(self.axis, r))
+        axis = safe_normalize(like(self.axis, r))
         first, second = _across(axis)
         angle = torch.atan2(dot(r, second), dot(r, first))
         stripe = 0.5 + 0.5 * torch.tanh(self.sharpness * torch.sin(self.count * angle))
-        bright, dark = _like(self.bright, r), _like(self.dark, r)
+        bright, dark = like(self.bright, r), like(self.dark, r)
         return torch.lerp(dark, bright, stripe[:, None])
 
 
@@ -230,7 +244,7 @@ class Environment(Material):
     reflected share = reflectivity + (1 − reflectivity) (1 − |n·v|)⁵; the rest is the colour of the surface, evenly lit.
 
     Attributes:
-        picture: equirectangular (H, W, 3) linear RGB, its top row towards +z; None: a clear sky.
+        picture: equirectangular (H, W, 3) linear RGB, its top row towards +z; None: `Sky()`.
         color: of the surface itself.
     """
 
@@ -240,28 +254,28 @@ class Environment(Material):
     opacity: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_opacity(self.opacity)
+        check_opacity(self.opacity)
         if self.picture is not None:
-            _check_picture("picture", self.picture)
+            check_picture("picture", self.picture)
         if not 0 <= self.reflectivity <= 1:
             raise ValueError(f"reflectivity must be from 0 to 1; got {self.reflectivity!r}")
 
     @property
     def order(self) -> int:
-        return _coloring(self.color).order
+        return Coloring.of(self.color).order
 
     def __call__(self, seen: Seen, lights: Sequence[Light]) -> Tensor:
         grazing = 1 - dot(seen.normal, seen.direction).abs().clamp(0, 1)
         share = (self.reflectivity + (1 - self.reflectivity) * grazing**5)[:, None]
-        return share * self.around(seen.reflected) + (1 - share) * _coloring(self.color)(seen)
+        return share * self.around(seen.reflected) + (1 - share) * Coloring.of(self.color)(seen)
 
     def around(self, directions: Tensor) -> Tensor:
         """Linear RGB (R, 3) of what lies in some unit directions (R, 3)."""
         if self.picture is None:
-            return _sky(directions)
+            return Sky()(directions)
         x, y, z = directions.unbind(-1)
         u = torch.atan2(y, x) / (2 * math.pi) + 0.5
-        return _looked_up(self.picture, u, torch.acos(z.clamp(-1, 1)) / math.pi, wrapped=False)
+        return looked_up(self.picture, u, torch.acos(z.clamp(-1, 1)) / math.pi, (True, False))
 
 
 @dataclass(frozen=True)
@@ -286,7 +300,7 @@ class Toon(Material):
     opacity: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_opacity(self.opacity)
+        check_opacity(self.opacity)
         if not isinstance(self.bands, int) or self.bands < 1:
             raise ValueError(f"bands must be an integer from 1 on; got {self.bands!r}")
         if not 0 <= self.contour < math.inf:
@@ -294,7 +308,7 @@ class Toon(Material):
 
     @property
     def order(self) -> int:
-        return 2 if self.contour else _coloring(self.color).order
+        return 2 if self.contour else Coloring.of(self.color).order
 
     def __call__(self, seen: Seen, lights: Sequence[Light]) -> Tensor:
         light = torch.zeros_like(seen.point)
@@ -303,10 +317,10 @@ class Toon(Material):
             facing = dot(seen.normal, toward).abs()
             visible = seen.visibility(source)
             facing = facing if visible is None else facing * visible
-            tint = _like(source.color, light)
+            tint = like(source.color, light)
             light = light + tint * (torch.ceil(facing * self.bands) / self.bands)[:, None]
-        color = _coloring(self.color)(seen) * (self.ambient + (1 - self.ambient) * light)
-        return torch.where(self._contour(seen)[:, None], _like(self.ink, color), color) if self.contour else color
+        color = Coloring.of(self.color)(seen) * (self.ambient + (1 - self.ambient) * light)
+        return torch.where(self._contour(seen)[:, None], like(self.ink, color), color) if self.contour else color
 
     def _contour(self, seen: Seen) -> Tensor:
         assert seen.curvatures is not None
@@ -317,33 +331,21 @@ class Toon(Material):
         return dot(seen.normal, seen.direction).abs() < (bent * (2 - bent)).sqrt()
 
 
-def _coloring(color: Color | Coloring) -> Coloring:
-    return color if isinstance(color, Uniform | ByField | ByCurvature | Triplanar) else Uniform(color)
-
-
 # --- pictures and directions ------------------------------------------------------------------------------------------
 
 
-def _looked_up(picture: Array, u: Tensor, v: Tensor, wrapped: bool) -> Tensor:
-    """Linear interpolation in a picture (H, W, 3) at u, v in 0 … 1 (across, down); u goes round, v too if `wrapped`."""
+def looked_up(picture: Array, u: Tensor, v: Tensor, wrapped: tuple[bool, bool]) -> Tensor:
+    """Linear interpolation in a picture (H, W, 3) at u, v (R,) in 0 … 1 (across, down), which go round if `wrapped`."""
     height, width = picture.shape[:2]
     picture = as_tensor(picture).to(u)
     x, y = u * width - 0.5, v * height - 0.5
     left, top = x.floor(), y.floor()
-    columns = [(left.long() + k) % width for k in range(2)]
-    rows = [(top.long() + k) % height if wrapped else (top.long() + k).clamp(0, height - 1) for k in range(2)]
+    columns, rows = (
+        [(first.long() + k) % n if around else (first.long() + k).clamp(0, n - 1) for k in range(2)]
+        for first, n, around in ((left, width, wrapped[0]), (top, height, wrapped[1]))
+    )
     above, below = (torch.lerp(picture[r, columns[0]], picture[r, columns[1]], (x - left)[:, None]) for r in rows)
     return torch.lerp(above, below, (y - top)[:, None])
-
-
-def _sky(directions: Tensor) -> Tensor:
-    """A clear sky over grey ground, with a soft sun."""
-    z = directions[:, 2:]
-    zenith, horizon, ground = (_like(c, z) for c in ((0.15, 0.35, 0.8), (0.8, 0.88, 0.95), (0.25, 0.23, 0.2)))
-    above = torch.lerp(horizon, zenith, z.clamp_min(0).sqrt())
-    sky = torch.lerp(ground, above, torch.sigmoid(40 * z))
-    sun = safe_normalize(_like((0.4, -0.5, 0.75), z))
-    return sky + 3 * torch.exp(400 * (dot(directions, sun) - 1))[:, None]
 
 
 def _across(axis: Tensor) -> tuple[Tensor, Tensor]:
@@ -354,22 +356,20 @@ def _across(axis: Tensor) -> tuple[Tensor, Tensor]:
     return first, torch.linalg.cross(axis, first)
 
 
-def _like(color: Color, example: Tensor) -> Tensor:
-    return torch.as_tensor(as_tensor(color), dtype=example.dtype, device=example.device)
-
-
-def _check_opacity(opacity: float) -> None:
+def check_opacity(opacity: float) -> None:
+    """Raises ValueError unless it is from 0 to 1."""
     if not 0 <= opacity <= 1:
         raise ValueError(f"opacity must be from 0 to 1; got {opacity!r}")
 
 
 def _check_direction(name: str, vector: Sequence[float]) -> None:
-    given = torch.as_tensor(as_tensor(vector), dtype=torch.float64)
+    given = as_numbers(vector)
     if given.shape != (3,) or not given.isfinite().all() or not given.any():
         raise ValueError(f"{name} must be three finite numbers, not all zero; got {vector!r}")
 
 
-def _check_picture(name: str, picture: Array) -> None:
+def check_picture(name: str, picture: Array) -> None:
+    """Raises ValueError unless it is (H, W, 3)."""
     picture = as_tensor(picture)
     if not isinstance(picture, Tensor) or picture.ndim != 3 or picture.shape[-1] != 3 or 0 in picture.shape:
         raise ValueError(

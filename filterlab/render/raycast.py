@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,12 +30,12 @@ from filterlab.render.image import (
 )
 from filterlab.render.materials import Material, Phong, Seen
 from filterlab.render.rays import Region, Spans, check_region, jitter, spans
-from filterlab.render.shading import Light
+from filterlab.render.scenery import Around, Block, Haze, Water
+from filterlab.render.shading import Light, like
 from filterlab.render.silhouettes import COUNTED, Eye, Silhouettes, swept
 from filterlab.surfaces.base import Hits, Surface, SurfacePoints, check_sheets
 
 _PART = 1 << 15  # rays at a time; what they meet is cut up further by the surface
-_LIFT = 1e-3  # voxels by which a ray to a light begins in front of the surface
 _MOST_SUBPIXELS = 64
 
 CHANNELS = {"color": 4, "depth": 1, "normal": 3, "position": 3, "sheets": 1}
@@ -50,11 +51,14 @@ class Casting:
     surface: Surface
     material: Material
     lights: tuple[Light, ...]
-    background: Tensor
+    background: Tensor | Around
     region: Region | None
     sheets: int
     shadows: bool
     dtype: torch.dtype
+    haze: Haze | None = None
+    water: Water | None = None
+    block: Block | None = None
 
     def __call__(self, origins: Tensor, directions: Tensor, channels: Sequence[str]) -> Tensor:
         """The channels of rays (R, 3), side by side (R, width)."""
@@ -63,7 +67,7 @@ class Casting:
         needed = self.material.order if "color" in channels else 1
         at = self.surface.at(inside.entry.to(self.dtype), directions.to(self.dtype), hits, needed)
         parts = {
-            "color": lambda: self._color(at, hits, directions),
+            "color": lambda: self._color(at, hits, origins, directions),
             "depth": lambda: _depth(origins, directions, at, hits),
             "normal": lambda: _first(at.normal),
             "position": lambda: _first(at.point),
@@ -89,24 +93,82 @@ class Casting:
         slack = 8 * torch.finfo(self.dtype).eps * self.surface.domain.diagonal
         return hits.where((length > 0) & (hits.t.detach() <= length + slack))
 
-    def _color(self, at: SurfacePoints, hits: Hits, directions: Tensor) -> Tensor:
+    def _color(self, at: SurfacePoints, hits: Hits, origins: Tensor, directions: Tensor) -> Tensor:
         """Sheets in front of each other, from the eye on, over the background: RGB and opacity (R, 4)."""
         valid = hits.valid
-        seen = self._seen(at, valid, directions)
+        seen = self._seen(at, hits, directions)
         colors = at.point.new_zeros(at.point.shape).index_put((valid,), self.material(seen, self.lights))
+        layers = Layers(
+            colors, self.material.opacity * valid.to(colors), self._distances(at, valid, origins, directions)
+        )
+        if self.water is not None:
+            layers = self._flooded(layers, self.water, origins, directions)
+        if self.block is not None:
+            layers = self._walled(layers, self.block, origins, directions)
+        if self.haze is not None:
+            layers = layers._replace(color=self.haze(layers.color, layers.distance))
         rgb, passing = at.point.new_zeros(len(valid), 3), at.point.new_ones(len(valid), 1)
         for k in range(self.sheets):
-            opacity = self.material.opacity * valid[:, k, None].to(rgb)
-            rgb, passing = rgb + passing * opacity * colors[:, k], passing * (1 - opacity)
-        return torch.cat((rgb + passing * self.background.to(rgb), 1 - passing), -1)
+            opacity = layers.opacity[:, k, None]
+            rgb, passing = rgb + passing * opacity * layers.color[:, k], passing * (1 - opacity)
+        return torch.cat((rgb + passing * self._behind(directions.to(rgb)), 1 - passing), -1)
 
-    def _seen(self, at: SurfacePoints, valid: Tensor, directions: Tensor) -> Seen:
+    def _behind(self, directions: Tensor) -> Tensor:
+        """Of the background: (3,), or (R, 3) where it depends on directions."""
+        return self.background.to(directions) if isinstance(self.background, Tensor) else self.background(directions)
+
+    def _distances(self, at: SurfacePoints, valid: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
+        """(R, k): world distances along unit rays, 0 where nothing is hit; they are asked by haze and water alone."""
+        if self.haze is None and self.water is None and self.block is None:
+            return at.point.new_zeros(valid.shape)
+        distance = dot(at.point.double() - origins[:, None], directions[:, None])
+        return torch.where(valid, distance, 0).to(at.point)
+
+    def _flooded(self, layers: Layers, water: Water, origins: Tensor, directions: Tensor) -> Layers:
+        """The same where water covers it: what the water mirrors, and the ground through it."""
+        lower, upper = self._box
+        crossing = water.crossing(origins, directions, lower, upper)
+        ground = torch.where(layers.opacity[:, 0] > 0, layers.distance[:, 0].double(), torch.inf)
+        wet = (crossing.distance < ground).nonzero()[:, 0]
+        if not len(wet):
+            return layers
+        face, own = crossing.distance[wet], layers.color[wet, 0]
+        point = origins[wet] + face[:, None] * directions[wet]
+        mirrored = directions[wet] * directions.new_tensor((1, 1, -1))
+        dry = replace(self, water=None)
+        around = dry(point, mirrored, ("color",))[:, :3]
+        share = crossing.share[wet, None].to(own)
+        color = share * around + (1 - share) * water.through(own, (ground[wet] - face).to(own))
+        return layers.with_first(wet, color, face)
+
+    def _walled(self, layers: Layers, block: Block, origins: Tensor, directions: Tensor) -> Layers:
+        """The same where the walls of the block are in front: earth, and water where that stands at them."""
+        lower, upper = self._box
+        distance = block.entry(origins, directions, lower, upper)
+        at = distance.isfinite().nonzero()[:, 0]
+        points = origins[at] + distance[at, None] * directions[at]
+        inside = self.surface.detached.jet(points, 0)[0] < 0
+        color = block.lit(points, self.lights, lower, upper)
+        if self.water is not None:
+            under = ~inside & (points[:, 2] < self.water.level)
+            color = torch.where(under[:, None], like(self.water.color, color), color)
+            inside = inside | under
+        return layers.with_first(at[inside], color[inside], distance[at][inside])
+
+    @property
+    def _box(self) -> tuple[list[float], list[float]]:
+        """Least and greatest x, y, z of the domain."""
+        lower, upper = self.surface.domain.corners().aminmax(dim=0)
+        return lower.tolist(), upper.tolist()
+
+    def _seen(self, at: SurfacePoints, hits: Hits, directions: Tensor) -> Seen:
         assert at.normal is not None
+        valid = hits.valid
         direction = directions.to(self.dtype)[:, None].expand_as(at.point)[valid]
         point, normal = at.point[valid], at.normal[valid]
         curved = (None, None) if at.curvatures is None else (at.curvatures[valid], at.principal[valid])  # type: ignore[index]
         toward_eye = torch.where(dot(normal, direction)[:, None] > 0, -normal, normal).detach()
-        lifted = point.detach() + _LIFT * self.surface.domain.voxel_size * toward_eye
+        lifted = point.detach() + self.surface.clearance(hits)[valid][:, None].to(point) * toward_eye
 
         def visibility(light: Light) -> Tensor | None:
             if not self.shadows or light.direction is None:  # a headlight shines wherever the eye sees
@@ -115,6 +177,20 @@ class Casting:
             return (~self.surface.met(lifted, toward)).to(point)
 
         return Seen(point, normal, direction, *curved, visibility)
+
+
+class Layers(NamedTuple):
+    """What a ray meets, from the eye on: colours (R, k, 3), opacities and world distances (R, k)."""
+
+    color: Tensor
+    opacity: Tensor
+    distance: Tensor
+
+    def with_first(self, rays: Tensor, color: Tensor, distance: Tensor) -> Layers:
+        """The same with something opaque in front, of so many rays (M,): colours (M, 3) and distances (M,)."""
+        put = lambda rows, new: rows.index_put((rays, torch.zeros_like(rays)), new.to(rows))  # noqa: E731
+        solid = torch.ones_like(distance)
+        return Layers(put(self.color, color), put(self.opacity, solid), put(self.distance, distance))
 
 
 def _first(rows: Tensor | None) -> Tensor:
@@ -135,7 +211,10 @@ def raycast(
     *,
     size: Sequence[int] | None = None,
     lights: Sequence[Light] = _FRONTAL,
-    background: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
+    background: Sequence[float] | Tensor | Around = (0.0, 0.0, 0.0),
+    haze: Haze | None = None,
+    water: Water | None = None,
+    block: Block | None = None,
     region: Region | None = None,
     sheets: int = 1,
     shadows: bool = False,
@@ -155,7 +234,13 @@ def raycast(
         material: what turns hits into colour; default `Phong()`.
         size: (width, height) of the image; only with a Camera.
         lights: all of them; default a white headlight.
-        background: linear RGB behind the surface; may require grad.
+        background: linear RGB behind the surface, which may require grad; or a function of unit directions (R, 3), such
+            as a `Sky()` or the `around` of an `Environment`.
+        haze: what distance does to colours, but not to the background; None: nothing.
+        water: a flat face of water within the domain's x and y, which mirrors the surface and the background; None:
+            none. It is in the colour only: other channels are those of the surface. One sheet.
+        block: walls of earth below a surface that ends at the sides of its domain; None: it is as thin as it is. In the
+            colour only, too.
         region: a world-space box (lower, upper): what lies outside is cut away.
         sheets: how many hits of a ray are composited, in exact order; 1 unless the material is transparent.
         shadows: whether a second ray to every light that is no headlight asks what stands in between.
@@ -190,12 +275,17 @@ def raycast(
         surface,
         material or Phong(),
         tuple(lights),
-        check_background(background, device),
+        background if callable(background) else check_background(background, device),
         None if region is None else check_region(region),
         sheets,
         shadows,
         dtype,
+        haze,
+        water,
+        block,
     )
+    if sheets > 1 and (water is not None or block is not None):
+        raise ValueError(f"water and block go with one sheet, of an opaque surface; got {sheets} sheets")
     at_once = max(sheets, silhouettes.lines * silhouettes.parts if silhouettes else 1)
     canvas = Canvas(seen, None, torch.is_grad_enabled(), sum(CHANNELS[name] for name in asked))
     with reporting(progress, seen.count) as report:

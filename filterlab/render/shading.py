@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, as_numbers
 from filterlab.ops.reference.optics import dot, power, safe_normalize
 
 
@@ -47,7 +47,7 @@ class Light:
         It is made a unit vector in float64, which has every length of it, and only then rounded to a shorter type.
         """
         assert self.direction is not None
-        return _like(safe_normalize(_numbers(self.direction)), example)
+        return like(safe_normalize(as_numbers(self.direction)), example)
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Shading:
     @property
     def numbers(self) -> dict[str, float]:
         """The largest numbers that shading is computed with, by what they are; light is that of all lights together."""
-        light = torch.stack([_numbers(light.color).detach().cpu() for light in self.lights] or [torch.zeros(3)])
+        light = torch.stack([as_numbers(light.color).detach().cpu() for light in self.lights] or [torch.zeros(3)])
         total = float(light.sum(0).max())
         return {
             "light": total,
@@ -124,15 +124,15 @@ class Shading:
         """
         normal, view = safe_normalize(gradient), -direction
         matt, shine = self._sums(normal, view, shadows or [None] * len(self.lights))
-        ambient, diffuse, specular = (_like(x, color) for x in (self.ambient, self.diffuse, self.specular))
+        ambient, diffuse, specular = (like(x, color) for x in (self.ambient, self.diffuse, self.specular))
         return color * (ambient + diffuse * matt) + specular * shine
 
     def _sums(self, normal: Tensor, view: Tensor, shadows: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
         """Σ I |n·l| and Σ I |n·h|^shininess, `(..., 3)` each."""
         matt, shine = torch.zeros((), dtype=view.dtype, device=view.device), torch.zeros_like(normal[..., :1])
-        shininess = _like(self.shininess, view)
+        shininess = like(self.shininess, view)
         for light, arriving in zip(self.lights, shadows, strict=True):
-            tint = _like(light.color, view)
+            tint = like(light.color, view)
             tint = tint if arriving is None else tint * arriving[..., None]
             if light.direction is None:
                 facing = half = dot(normal, view).abs()
@@ -152,14 +152,11 @@ def _plain(value: float | Tensor) -> float:
 def _checked(name: str, expected: str, value: Sequence[float] | float | Array) -> Tensor:
     """The value as float64. Raises ValueError that says what was expected."""
     try:
-        return _numbers(value)
+        return as_numbers(value)
     except (TypeError, ValueError, ArithmeticError, RuntimeError):
         raise ValueError(f"{name} must be {expected}; got {value!r}") from None
 
 
-def _numbers(value: Sequence[float] | float | Array) -> Tensor:
-    return torch.as_tensor(as_tensor(value), dtype=torch.float64)
-
-
-def _like(value: Sequence[float] | float | Array, example: Tensor) -> Tensor:
-    return torch.as_tensor(as_tensor(value), dtype=example.dtype, device=example.device)
+def like(value: Sequence[float] | float | Array, example: Tensor) -> Tensor:
+    """Numbers in the dtype and on the device of a tensor."""
+    return as_numbers(value, example.dtype, example.device)

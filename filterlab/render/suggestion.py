@@ -118,8 +118,6 @@ def direction_for(field: Field) -> Direction:
 
 def _thresholds(values: Tensor) -> Tensor:
     """(K − 1,) between K classes of values (M,), as many as there are; none where all are the same."""
-    from skimage.filters import threshold_multiotsu
-
     ends = values.sort().values[[round(part * (len(values) - 1)) for part in (_LEFT_OUT, 1 - _LEFT_OUT)]]
     low, high = ends if bool(ends[1] > ends[0]) else values.aminmax()
     if not bool(high > low):
@@ -127,10 +125,29 @@ def _thresholds(values: Tensor) -> Tensor:
     counts = torch.histc(values.clamp(low, high), _BINS, float(low), float(high))
     middles = low + (high - low) * (torch.arange(_BINS, dtype=values.dtype) + 0.5) / _BINS
     classes = min(_CLASSES, int((counts > 0).sum()))
-    found = threshold_multiotsu(classes=classes, hist=(counts.numpy(), middles.numpy()))
-    ends = torch.from_numpy(found).double() + (high - low) / (2 * _BINS)  # of the bins that they are
+    ends = middles[_last_bins(counts, middles - middles.mean(), classes)] + (high - low) / (2 * _BINS)
     # between the values on both sides: where there are none for a while, in the middle
     return torch.stack([(values[values <= end].max() + values[values > end].min()) / 2 for end in ends])
+
+
+def _last_bins(counts: Tensor, middles: Tensor, classes: int) -> Tensor:
+    """(K − 1,) of bins (B,) the last one of every class but the last, where the variance between classes is largest:
+
+    Σ_k (Σ n_b x_b)² / Σ n_b over the bins b of class k; classes without a value are none. Best first parts are extended
+    class by class, O(K B²). (scikit-image has it, for 0.3 s of imports.)
+    """
+    n, s = (functional.pad(x.double().cumsum(0), (1, 0)) for x in (counts, counts * middles))
+    number = (n - n[:, None]).triu(1)  # of the values from bin i up to bin j
+    between = torch.where(number > 0, (s - s[:, None]) ** 2 / number, -torch.inf)
+    best, ways = between[0], []
+    for _ in range(classes - 1):
+        best, way = (best[:, None] + between).max(0)
+        ways.append(way)
+    last, ends = len(counts), []
+    for way in reversed(ways):
+        last = int(way[last])
+        ends.append(last - 1)
+    return torch.tensor(ends[::-1], dtype=torch.int64)
 
 
 def _around(kinds: Tensor) -> int:

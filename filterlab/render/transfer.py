@@ -11,7 +11,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, as_numbers, as_tensor
 from filterlab.fields.base import Field
 from filterlab.geometry import times_matrix
 from filterlab.io.images import from_srgb
@@ -69,7 +69,7 @@ class TransferFunction(Table):
             raise ValueError(f"peaks must be one or more (center, width, height, rgb); got {peaks!r}")
         centers, halves, heights = (torch.stack([_scalar(peak[k]) for peak in peaks]) for k in range(3))
         halves = halves / 2
-        colors = torch.stack([torch.as_tensor(as_tensor(peak[3]), dtype=torch.float64) for peak in peaks])
+        colors = torch.stack([as_numbers(peak[3]) for peak in peaks])
         if not (halves.detach() > 0).all():
             raise ValueError(f"peak widths must be positive; got {(2 * halves).tolist()}")
         x = torch.cat((centers - halves, centers, centers + halves)).sort().values
@@ -120,14 +120,18 @@ class TransferFunction(Table):
         return cls(x, colors.color(colors.locate(x)), ramp.opacity(ramp.locate(x)), unit)
 
     @classmethod
-    def suggested(cls, field: Field) -> Self:
+    def suggested(cls, field: Field, samples: suggestion.Sampled | None = None) -> Self:
         """One to begin with, from the histogram of a field: what is around is clear, up to three classes of values are
         not, in blue, tan and ivory; see `filterlab.render.suggestion`. Opacities are for a voxel.
+
+        Args:
+            field: unbatched.
+            samples: of it, where they are known: `filterlab.render.suggestion.sampled(field)`.
 
         Raises:
             ValueError: a batched field, or one without a finite value.
         """
-        return cls(*suggestion.tables(suggestion.sampled(field)), field.domain.voxel_size)
+        return cls(*suggestion.tables(samples or suggestion.sampled(field)), field.domain.voxel_size)
 
     @property
     def requires_grad(self) -> bool:
@@ -163,7 +167,7 @@ class TransferFunction(Table):
 
 
 def _scalar(value: Numbers | float) -> Tensor:
-    return torch.as_tensor(as_tensor(value), dtype=torch.float64).reshape(())
+    return as_numbers(value).reshape(())
 
 
 def _unit(value: float) -> float:
@@ -175,7 +179,7 @@ def _unit(value: float) -> float:
 
 def _table(name: str, values: Sequence | Array) -> Tensor:
     try:
-        return values if isinstance(values, Tensor) else torch.as_tensor(as_tensor(values), dtype=torch.float64)
+        return values if isinstance(values, Tensor) else as_numbers(values)
     except (TypeError, ValueError, ArithmeticError, RuntimeError):
         raise ValueError(f"{name} must be numbers; got {values!r}") from None
 

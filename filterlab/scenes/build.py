@@ -15,7 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from filterlab.fields.base import Domain
 from filterlab.io.config import dump_data, load_config, loads_config
+from filterlab.io.covers import load_slim
 from filterlab.recommendation import recommend, report
 from filterlab.render.dvr import Frame, prepare
 from filterlab.render.image import Progress
@@ -26,14 +28,16 @@ from filterlab.render.sampling import Sampling
 from filterlab.render.shading import Light, Shading
 from filterlab.render.transfer import TransferFunction
 from filterlab.scenes.model import Lighting, Scene, SceneMethod, SurfaceModel
-from filterlab.scenes.shown import Shown
+from filterlab.scenes.shown import OfField, Shown
 from filterlab.scenes.values import PreparedProjection, PreparedSlice, camera_of, projection, sliced
+from filterlab.surfaces.base import Surface
 from filterlab.surfaces.level_set import LevelSet
+from filterlab.surfaces.slim import Slim
 from filterlab.volume import Volume
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prepared(Shown):
+class Prepared(OfField):
     """A medium: what `render` takes.
 
     Attributes:
@@ -68,10 +72,10 @@ class Prepared(Shown):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PreparedSurface(Shown):
+class Cast(Shown):
     """A surface: what `raycast` takes."""
 
-    surface: LevelSet
+    surface: Surface
     material: Material
     lights: tuple[Light, ...]
 
@@ -99,6 +103,24 @@ class PreparedSurface(Shown):
         return image
 
 
+@dataclass(frozen=True, kw_only=True)
+class PreparedSurface(Cast, OfField):
+    """The level set of a field."""
+
+    surface: LevelSet
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedSlim(Cast):
+    """A SLIM surface."""
+
+    surface: Slim
+
+    @property
+    def domain(self) -> Domain:
+        return self.surface.domain
+
+
 def load_scene(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Scene:
     """The scene in a YAML file, with some of its keys set anew ({"camera.window": "[0, 0, 0.5, 0.5]"}).
 
@@ -123,6 +145,16 @@ def surface_scene(volume: str | os.PathLike[str], level: str, overrides: Mapping
     return loads_config(dump_data(content), Scene, overrides, name="--level")
 
 
+def slim_scene(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Scene:
+    """The scene of a SLIM surface in a file, seen whole, lit as that of a `surface_scene`.
+
+    Raises:
+        ConfigError: as `load_scene`.
+    """
+    content = {"surface": {"slim": str(path), "subpixels": 2}, **_SURFACE, "camera": {"direction": _DIRECTION}}
+    return loads_config(dump_data(content), Scene, overrides, name=str(path))
+
+
 def values_scene(volume: str | os.PathLike[str], overrides: Mapping[str, str]) -> Scene:
     """The scene of a volume file whose values are shown: the overrides have a `mip` or a `slice`.
 
@@ -132,8 +164,9 @@ def values_scene(volume: str | os.PathLike[str], overrides: Mapping[str, str]) -
     return loads_config(dump_data({"volume": str(volume)}), Scene, overrides, name="the command line")
 
 
+_DIRECTION = [-0.6, 0.75, -0.5]
 _SURFACE: Mapping[str, Any] = {
-    "camera": {"direction": [-0.6, 0.75, -0.5], "window": [0.12, 0.12, 0.88, 0.88]},
+    "camera": {"direction": _DIRECTION, "window": [0.12, 0.12, 0.88, 0.88]},
     "lighting": {"lights": [{"direction": [0.5, -0.6, 0.8], "color": [0.9, 0.88, 0.85]}, {"color": [0.3, 0.32, 0.36]}]},
     "background": [0.02, 0.022, 0.03],
 }
@@ -147,15 +180,20 @@ def _number(text: str) -> float | str:
         return text
 
 
-AnyPrepared = Prepared | PreparedSurface | PreparedProjection | PreparedSlice
+AnyPrepared = Prepared | PreparedSurface | PreparedSlim | PreparedProjection | PreparedSlice
 
 
-def build(scene: Scene) -> AnyPrepared:
+def build(scene: Scene, volume: Volume | None = None) -> AnyPrepared:
     """Loads or samples what the scene shows, reconstructs it and builds camera, lights and what they fall on.
+
+    Args:
+        volume: that of the scene's file, where it has been read.
 
     Raises ValueError where `method: auto` finds nothing within its budget, with the best there is.
     """
-    volume = _volume(scene)
+    if scene.slim is not None:
+        return _cover(scene, scene.slim)
+    volume = _volume(scene, volume)
     scene, chosen = settled(scene, volume)
     if volume is None:
         assert scene.signal is not None
@@ -164,14 +202,8 @@ def build(scene: Scene) -> AnyPrepared:
     else:
         field = (scene.method or SceneMethod()).build(volume)
         value_range = partial(_range, volume.samples)
-    shown: dict[str, Any] = {
-        "scene": scene,
+    shown: dict[str, Any] = _shown(scene, field.domain) | {
         "field": field,
-        "camera": camera_of(scene, field.domain),
-        "size": scene.size,
-        "background": scene.background,
-        "region": scene.region.build() if scene.region else None,
-        "device": scene.device,
         "volume_bytes": 0 if volume is None else volume.samples.nbytes,
         "chosen": chosen,
     }
@@ -190,17 +222,36 @@ def build(scene: Scene) -> AnyPrepared:
     )
 
 
+def _shown(scene: Scene, domain: Domain) -> dict[str, Any]:
+    """What every scene has."""
+    return {
+        "scene": scene,
+        "camera": camera_of(scene, domain),
+        "size": scene.size,
+        "background": scene.background,
+        "region": scene.region.build() if scene.region else None,
+        "device": scene.device,
+    }
+
+
 def _surface(
     asked: SurfaceModel, shown: dict[str, Any], value_range: Callable[[], tuple[float, float]]
 ) -> PreparedSurface:
-    scene, field = shown["scene"], shown["field"]
-    lighting = scene.lighting or Lighting()
-    return PreparedSurface(
-        **shown,
-        surface=LevelSet(field, asked.at(value_range)),
-        material=asked.material.build(),
-        lights=tuple(lighting.build().lights),
-    )
+    surface = LevelSet(shown["field"], asked.at(value_range))
+    return PreparedSurface(**shown, surface=surface, **_lit(shown["scene"], asked))
+
+
+def _cover(scene: Scene, path: str) -> PreparedSlim:
+    assert scene.surface is not None
+    slim = load_slim(path)
+    slim = slim.with_tensors([x.to(scene.device) for x in slim.tensors])
+    return PreparedSlim(**_shown(scene, slim.domain), surface=slim, **_lit(scene, scene.surface))
+
+
+def _lit(scene: Scene, asked: SurfaceModel) -> dict[str, Any]:
+    """What a surface is made of, and its lights."""
+    lights = (scene.lighting or Lighting()).build().lights
+    return {"material": asked.material.build(), "lights": tuple(lights)}
 
 
 def render_scene(scene: Scene, progress: Progress = False) -> Tensor:
@@ -224,8 +275,8 @@ def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]
         return scene, ()
     found = recommend(volume, method.max_error, task="dvr", boundary=method.boundary, nan=method.nan)
     if found.pick is None:
-        best = report.sentences(found)[-1].removeprefix("The ").removesuffix(".")
-        raise ValueError(f"method: found none within max_error {report.percent(method.max_error)}; the {best}")
+        told = " ".join(report.sentences(found)[2:]).removeprefix("The ").removesuffix(".")
+        raise ValueError(f"method: found none within max_error {report.percent(method.max_error)}; the {told}")
     explicit = SceneMethod(
         name=found.pick.method,
         scheme=found.pick.scheme,
@@ -237,11 +288,11 @@ def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]
     return scene.model_copy(update={"method": explicit, "step": step}), tuple(report.sentences(found))
 
 
-def _volume(scene: Scene) -> Volume | None:
+def _volume(scene: Scene, loaded: Volume | None) -> Volume | None:
     """The samples, in the type and on the device of the scene; None for a signal that is shown as it is."""
     dtype = scene.dtype
     if scene.volume is not None:
-        volume = scene.volume.load()
+        volume = loaded or scene.volume.load()
     else:
         assert scene.signal is not None
         if scene.signal.samples is None:

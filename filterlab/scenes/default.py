@@ -13,9 +13,10 @@ from filterlab import missing_values
 from filterlab.fields.base import Field
 from filterlab.io.config import dump_data, loads_config
 from filterlab.render.camera import PerspectiveCamera
-from filterlab.render.suggestion import direction_for
+from filterlab.render.suggestion import direction_for, sampled
 from filterlab.render.transfer import TransferFunction
 from filterlab.scenes.model import Scene, SceneMethod
+from filterlab.volume import Volume
 
 STEP = 0.35  # voxels; with jitter no rings of segments are left to be seen
 _DIGITS = 6  # of what is suggested
@@ -36,6 +37,11 @@ def default_scene(volume: str | os.PathLike[str], overrides: Mapping[str, str] |
     Raises:
         ConfigError: as `load_scene`. VolumeFileError: a damaged file. ValueError: a volume without a finite voxel.
     """
+    return default_view(volume, overrides)[0]
+
+
+def default_view(volume: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> tuple[Scene, Volume]:
+    """`default_scene`, and the volume that was read to find it, for `filterlab.scenes.build.build`."""
     overrides = dict(overrides or {})
     first = {key: text for key, text in overrides.items() if key.split(".")[0] in _FIRST}
     bare = {"volume": str(volume), "size": list(_SIZE), "surface": 0}
@@ -50,14 +56,15 @@ def default_scene(volume: str | os.PathLike[str], overrides: Mapping[str, str] |
         content["method"]["nan"] = "propagate"
     # classes and framing do not hang on the method: trilinear is soonest done
     field = SceneMethod(name="trilinear", boundary=method.boundary).build(samples, nan="propagate")
-    return loads_config(dump_data(content | suggested(field, asked.size)), Scene, overrides, name=str(volume))
+    scene = loads_config(dump_data(content | suggested(field, asked.size)), Scene, overrides, name=str(volume))
+    return scene, samples
 
 
 def suggested(field: Field, size: tuple[int, int] = _SIZE) -> dict[str, Any]:
     """All of a scene but its volume and method, for a field and an image of (width, height)."""
-    transfer = TransferFunction.suggested(field)
-    direction = direction_for(field)
-    camera = PerspectiveCamera.suggested(field, transfer, direction, aspect=size[0] / size[1])
+    samples, direction = sampled(field), direction_for(field)
+    transfer = TransferFunction.suggested(field, samples)
+    camera = PerspectiveCamera.suggested(field, transfer, direction, aspect=size[0] / size[1], samples=samples)
     return {
         "transfer": {"unit": transfer.unit, "points": _points(transfer)},
         "camera": {

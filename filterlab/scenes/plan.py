@@ -25,7 +25,7 @@ from filterlab.ops.reference.march import segments
 from filterlab.render.dvr import Frame
 from filterlab.render.fused import FusedMarcher, empty_bricks, why_not_fused
 from filterlab.render.plain import Medium
-from filterlab.scenes.build import AnyPrepared, Prepared, PreparedSurface
+from filterlab.scenes.build import AnyPrepared, Cast, Prepared, PreparedSlim, PreparedSurface
 from filterlab.scenes.model import Scene
 from filterlab.scenes.shown import Shown
 from filterlab.scenes.values import PreparedProjection, PreparedValues, samples_of
@@ -35,6 +35,7 @@ _PROBE_RAYS = 4096
 _PROBE_SEGMENTS = 1 << 21
 _PROBE_NODES = 1 << 17
 _REPEATS = 5
+_BALL_BYTES, _PLANE_BYTES = 188, 32  # of an index and what is in it (`surfaces.Slim`)
 _DERIVATIVES = ("values", "values and gradients", "values, gradients and Hessians")
 
 
@@ -197,7 +198,33 @@ class MeshPlan:
         return asdict(self)
 
 
-AnyPlan = Plan | SurfacePlan | ValuePlan
+@dataclass(frozen=True)
+class SlimPlan:
+    """What casting rays at a SLIM surface takes.
+
+    Attributes:
+        balls: of the cover. cuts: planes that some of them are cut by, for each.
+        order, rays, image_bytes, seconds, absent: as in `SurfacePlan`.
+        cover_bytes: memory of its numbers and their index.
+        chosen: nothing.
+    """
+
+    balls: int
+    cuts: int
+    order: int
+    rays: int
+    cover_bytes: int
+    image_bytes: int
+    seconds: Quartiles
+    absent: tuple[str, ...]
+    chosen: tuple[str, ...] = ()
+
+    def data(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+
+AnyPlan = Plan | SurfacePlan | SlimPlan | ValuePlan
 
 
 def plan_of_mesh(prepared: PreparedSurface, step: float) -> MeshPlan:
@@ -233,6 +260,8 @@ def plan(prepared: AnyPrepared) -> AnyPlan:
     """
     if isinstance(prepared, PreparedValues):
         return _plan_of_values(prepared)
+    if isinstance(prepared, PreparedSlim):
+        return _plan_of_slim(prepared)
     return _plan_of_surface(prepared) if isinstance(prepared, PreparedSurface) else _plan_of_medium(prepared)
 
 
@@ -281,7 +310,24 @@ def _plan_of_surface(prepared: PreparedSurface) -> SurfacePlan:
     )
 
 
-def _seconds_of_surface(prepared: PreparedSurface, rays: int) -> Quartiles:
+def _plan_of_slim(prepared: PreparedSlim) -> SlimPlan:
+    scene, slim, (width, height) = prepared.scene, prepared.surface, prepared.size
+    assert scene.surface is not None
+    rays, cuts = width * height * scene.surface.subpixels**2, 0 if slim.cuts is None else slim.cuts.shape[1]
+    numbers = sum(x.nbytes for x in slim.tensors) + (0 if slim.cuts is None else slim.cuts.nbytes)
+    return SlimPlan(
+        balls=len(slim),
+        cuts=cuts,
+        order=prepared.material.order,
+        rays=rays,
+        cover_bytes=numbers + len(slim) * (_BALL_BYTES + _PLANE_BYTES * cuts),
+        image_bytes=width * height * 4 * scene.dtype.itemsize,
+        seconds=_seconds_of_surface(prepared, rays),
+        absent=_absent_of_surface(scene),
+    )
+
+
+def _seconds_of_surface(prepared: Cast, rays: int) -> Quartiles:
     """Of all rays, from one for each pixel of a smaller picture."""
     scene = prepared.scene.model_copy(
         update={"surface": prepared.scene.surface.model_copy(update={"subpixels": 1})}  # type: ignore[union-attr]

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from filterlab.recommendation.report import duration, percent, size
-from filterlab.scenes.plan import AnyPlan, MeshPlan, Plan, SurfacePlan, ValuePlan
+from filterlab.scenes.plan import AnyPlan, MeshPlan, Plan, SlimPlan, SurfacePlan, ValuePlan
 
 
 def table(plan: AnyPlan | MeshPlan, pictures: int = 1) -> Table:
@@ -22,7 +22,7 @@ def table(plan: AnyPlan | MeshPlan, pictures: int = 1) -> Table:
     return shown
 
 
-def _begin(plan: AnyPlan | MeshPlan) -> list[tuple[str, str]]:
+def _begin(plan: Plan | SurfacePlan | ValuePlan | MeshPlan) -> list[tuple[str, str]]:
     taps = "" if plan.taps is None else f", {plan.taps} taps"
     lines = [("method", f"{plan.method} ({plan.scheme}), coefficients as {plan.storage}{taps}")]
     return lines + [("" if i else "chosen", sentence) for i, sentence in enumerate(plan.chosen)]
@@ -36,6 +36,13 @@ def _lines_of_surface(plan: SurfacePlan) -> list[tuple[str, str]]:
     lines.append(("rays", f"{plan.rays:,}"))
     sizes = (("volume", plan.volume_bytes), ("coefficients", plan.coefficient_bytes), ("image", plan.image_bytes))
     return lines + _end(plan, sizes, "cast")
+
+
+def _lines_of_slim(plan: SlimPlan) -> list[tuple[str, str]]:
+    cut = f", cut by up to {plan.cuts} planes" if plan.cuts else ""
+    asked = {1: "gradients", 2: "gradients and Hessians"}[plan.order]
+    lines = [("surface", f"SLIM, {plan.balls:,} balls{cut}; {asked} at hits"), ("rays", f"{plan.rays:,}")]
+    return lines + _end(plan, (("cover", plan.cover_bytes), ("image", plan.image_bytes)), "cast")
 
 
 def _lines(plan: Plan) -> list[tuple[str, str]]:
@@ -111,6 +118,7 @@ def _skipping(plan: Plan) -> str:
 _LINES: dict[type, Callable[[Any], list[tuple[str, str]]]] = {
     Plan: _lines,
     SurfacePlan: _lines_of_surface,
+    SlimPlan: _lines_of_slim,
     ValuePlan: _lines_of_values,
     MeshPlan: _lines_of_mesh,
 }

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from filterlab.fields.base import Field
+from filterlab.fields.base import Domain, Field
 from filterlab.render.camera import Camera
 from filterlab.render.image import Progress
 from filterlab.render.legend import Legend
@@ -27,7 +27,6 @@ class Shown(ABC):
     """
 
     scene: Scene
-    field: Field
     camera: Camera
     size: tuple[int, int]
     background: Vector
@@ -37,6 +36,11 @@ class Shown(ABC):
     chosen: tuple[str, ...] = ()
 
     @property
+    @abstractmethod
+    def domain(self) -> Domain:
+        """What is framed."""
+
+    @property
     def legend(self) -> Legend | None:
         """What stands for what values, where there is such a thing."""
         return None
@@ -44,3 +48,14 @@ class Shown(ABC):
     @abstractmethod
     def render(self, progress: Progress = False) -> Tensor:
         """The image `(H, W, 4)`: linear RGB over the background, and opacity."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfField(Shown):
+    """A scene of a field."""
+
+    field: Field
+
+    @property
+    def domain(self) -> Domain:
+        return self.field.domain

@@ -44,7 +44,7 @@ def _framed(prepared: AnyPrepared, camera: Camera) -> Camera:
     """The camera that looks in the same direction, as near as all of the domain can be seen from there."""
     position, target = (torch.as_tensor(v, dtype=torch.float64) for v in (camera.position, camera.target))
     view = prepared.scene.camera.model_copy(update={"direction": tuple((target - position).tolist())})
-    return view.build(prepared.field.domain, prepared.size)
+    return view.build(prepared.domain, prepared.size)
 
 
 def _at_one_distance(cameras: list[Camera]) -> list[Camera]:

@@ -28,7 +28,7 @@ from filterlab.render.values import (
 )
 from filterlab.scenes.model import MipModel, Scene, SliceModel
 from filterlab.scenes.model.values import ValueColors
-from filterlab.scenes.shown import Shown
+from filterlab.scenes.shown import OfField
 
 Range = Callable[[], tuple[float, float]]
 
@@ -44,7 +44,7 @@ class TransferColors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PreparedValues(Shown):
+class PreparedValues(OfField):
     """A picture of values.
 
     Attributes:

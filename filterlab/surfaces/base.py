@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +33,7 @@ MAX_SHEETS = 4096
 _STEPS = 2  # of Newton's method: derivatives up to the second
 _FAR = 64  # diameters of the domain from which on o + t d is polished
 _BESIDE = 1e-3  # voxels from a hit, along its ray, to where derivatives are looked for that are none at it
+_LIFT = 1e-3  # voxels by which a ray to a light begins in front of the surface
 _POLISH = 1e-3  # of a voxel, by at most: rays that are nearly tangents turn the rounding of o + t d into long ways
 
 
@@ -43,10 +44,12 @@ class Hits:
     Attributes:
         t: (...) in units of each ray's direction, ∞ where there is none; differentiable.
         piece: (...) int64, which piece of the surface is hit, −1 where none is; None: it has no pieces.
+        blend: (..., 6) float64, of what a hit is blended, as `surfaces.slim` says; None: it is of no more than one.
     """
 
     t: Tensor
     piece: Tensor | None = None
+    blend: Tensor | None = None
 
     @property
     def valid(self) -> Tensor:
@@ -56,16 +59,31 @@ class Hits:
     def where(self, kept: Tensor) -> Hits:
         """Those of a mask that broadcasts to (...), none elsewhere."""
         piece = None if self.piece is None else torch.where(kept, self.piece, -1)
-        return Hits(torch.where(kept, self.t, torch.inf), piece)
+        return replace(self, t=torch.where(kept, self.t, torch.inf), piece=piece)
 
     def as_sheets(self) -> Hits:
         """(..., 1): the same as one sheet of hits."""
-        return Hits(self.t[..., None], None if self.piece is None else self.piece[..., None])
+        piece = None if self.piece is None else self.piece[..., None]
+        return Hits(self.t[..., None], piece, None if self.blend is None else self.blend[..., None, :])
 
     def of_rays(self, shape: Sequence[int], dtype: torch.dtype) -> Hits:
         """In another shape and type, without derivatives."""
         piece = None if self.piece is None else self.piece.reshape(tuple(shape))
-        return Hits(self.t.detach().reshape(tuple(shape)).to(dtype), piece)
+        blend = None if self.blend is None else self.blend.detach().reshape(*shape, self.blend.shape[-1])
+        return Hits(self.t.detach().reshape(tuple(shape)).to(dtype), piece, blend)
+
+    def at(self, index: Tensor) -> Hits:
+        """Those (M,) at flat places."""
+        rows = (None if x is None else x.flatten().index_select(0, index) for x in (self.t, self.piece))
+        return Hits(*rows, None if self.blend is None else self.blend.flatten(0, -2).index_select(0, index))  # type: ignore[arg-type]
+
+    def with_at(self, index: Tensor, hits: Hits) -> Hits:
+        """The same, with other t and blends at flat places."""
+        t = self.t.flatten().index_copy(0, index, hits.t).reshape(self.t.shape)
+        if self.blend is None or hits.blend is None:
+            return replace(self, t=t)
+        blend = self.blend.flatten(0, -2).index_copy(0, index, hits.blend).reshape(self.blend.shape)
+        return replace(self, t=t, blend=blend)
 
 
 class SurfacePoints(NamedTuple):
@@ -170,6 +188,10 @@ class Surface(ABC):
         found = self.detached._sheets(o, d, sheets, farthest).of_rays((*origins.shape[:-1], sheets), origins.dtype)
         return self._attached(found, origins[..., None, :], directions[..., None, :])
 
+    def clearance(self, hit: Hits) -> Tensor:
+        """How far off a hit (...) a ray to a light begins, in world units."""
+        return torch.full_like(hit.t.detach(), _LIFT * self.domain.voxel_size)
+
     def at(self, origins: Array, directions: Array, hit: Hits, order: int = 1) -> SurfacePoints:
         """What is known of the surface at hits.
 
@@ -195,11 +217,16 @@ class Surface(ABC):
         if self.in_pieces and hit.piece is None:
             raise ValueError(f"hits of {type(self).__name__} tell which piece is hit; got hits with piece=None")
         index = _where(hit.valid)
-        o, d, t = _chosen(index, shape, origins, directions, hit.t[..., None])
-        piece = _chosen_pieces(index, hit)
-        point = self._polished(o, d, t[:, 0], piece)
-        rows = _geometry(point, self._derivatives(point, d, order, piece)) if order else SurfacePoints(point)
+        o, d = _chosen(index, shape, origins, directions)
+        rows = self._known(o, d, hit.at(index), order)
         return SurfacePoints(*_spread([row for row in rows if row is not None], index, shape))
+
+    def _known(self, origins: Tensor, directions: Tensor, hit: Hits, order: int) -> SurfacePoints:
+        """What is known at hits (M,) of rays (M, 3)."""
+        point = self._polished(origins, directions, hit.t, hit.piece)
+        return (
+            geometry(point, self._derivatives(point, directions, order, hit.piece)) if order else SurfacePoints(point)
+        )
 
     def _derivatives(self, points: Tensor, directions: Tensor, order: int, piece: Tensor | None) -> tuple[Tensor, ...]:
         """Gradient, and Hessian, at hits (M, 3); where they are NaN, beside what is missing, just before or behind."""
@@ -240,21 +267,31 @@ class Surface(ABC):
 
     def _attached(self, hit: Hits, origins: Tensor, directions: Tensor) -> Hits:
         """The same hits, with derivatives."""
-        tensors, t = None if transforming() else self.tensors, hit.t
-        if not torch.is_grad_enabled() or (tensors is not None and not _asked(origins, directions, *tensors)):
+        if not torch.is_grad_enabled() or not (transforming() or self._asked(origins, directions)):
             return hit
         index = _where(hit.valid)
         if not len(index) or not self._follows(index[:1], hit, origins, directions):
             return hit
-        o, d, own = _chosen(index, t.shape, origins, directions, t[..., None])
-        own, piece = own[:, 0], _chosen_pieces(index, hit)
-        own = self._stepped(o, d, own, piece) if tensors is None else _Attached.apply(self, piece, own, o, d, *tensors)
-        return Hits(t.flatten().index_copy(0, index, own).reshape(t.shape), hit.piece)
+        o, d = _chosen(index, hit.t.shape, origins, directions)
+        return hit.with_at(index, self._moving(o, d, hit.at(index)))
+
+    def _asked(self, *rays: Tensor) -> bool:
+        """Whether derivatives are asked by rays, or by what the surface is made of, as far as it can tell."""
+        tensors = self.tensors
+        return tensors is None or any(x.requires_grad for x in (*rays, *tensors))
 
     def _follows(self, index: Tensor, hit: Hits, origins: Tensor, directions: Tensor) -> bool:
         """Whether those hits move with anything that derivatives are asked by."""
-        o, d, t = _chosen(index, hit.t.shape, origins, directions, hit.t[..., None])
-        return self._value(o + t * d, _chosen_pieces(index, hit)).requires_grad
+        o, d = _chosen(index, hit.t.shape, origins, directions)
+        own = hit.at(index)
+        return self._value(_along(o, d, own.t), own.piece).requires_grad
+
+    def _moving(self, origins: Tensor, directions: Tensor, hit: Hits) -> Hits:
+        """Hits (M,) of rays (M, 3), with derivatives."""
+        tensors = None if transforming() else self.tensors
+        if tensors is None:
+            return replace(hit, t=self._stepped(origins, directions, hit.t, hit.piece))
+        return replace(hit, t=_Attached.apply(self, hit.piece, hit.t, origins, directions, *tensors))
 
     def _stepped(self, origins: Tensor, directions: Tensor, t: Tensor, piece: Tensor | None) -> Tensor:
         """t (M,) with the derivatives of steps of Newton's method."""
@@ -343,7 +380,7 @@ def check_rays(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     origins, directions = as_tensor(origins), as_tensor(directions)
     rays = _broadcast(origins, directions)
     for name, x in (("origins", origins), ("directions", directions)):
-        if not _all_finite(x.detach()):
+        if not all_finite(x.detach()):
             wrong = int((~x.detach().isfinite()).any(-1).sum())
             raise ValueError(f"{name} must be finite; {wrong} rays are not")
     some_zero = int(directions.detach().count_nonzero()) < directions.numel()
@@ -372,18 +409,13 @@ def _broadcast(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     return o, d
 
 
-def _all_finite(x: Tensor) -> bool:
-    """A finite sum has finite terms; finite terms may have another one."""
+def all_finite(x: Tensor) -> bool:
+    """Whether all numbers are: a finite sum has finite terms; finite terms may have another one."""
     return math.isfinite(float(x.sum())) or bool(x.isfinite().all())
 
 
 def _along(origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
     return origins + t[..., None] * directions
-
-
-def _asked(*tensors: Tensor) -> bool:
-    """Whether derivatives are asked by any of them."""
-    return any(x.requires_grad for x in tensors)
 
 
 def _where(mask: Tensor) -> Tensor:
@@ -402,11 +434,6 @@ def _chosen(index: Tensor, shape: torch.Size, *rows: Tensor) -> list[Tensor]:
     return [x.expand(*shape, x.shape[-1]).reshape(-1, x.shape[-1]).index_select(0, index) for x in rows]
 
 
-def _chosen_pieces(index: Tensor, hit: Hits) -> Tensor | None:
-    """Those at flat places: (M,)."""
-    return None if hit.piece is None else hit.piece.flatten().index_select(0, index)
-
-
 def _spread(rows: Sequence[Tensor], index: Tensor, shape: torch.Size) -> list[Tensor]:
     """Rows (M, …) at flat places of (*shape, …), 0 elsewhere."""
     joined = torch.cat([row.flatten(1) for row in rows], 1)
@@ -418,16 +445,16 @@ def _spread(rows: Sequence[Tensor], index: Tensor, shape: torch.Size) -> list[Te
 # --- the geometry of a level set --------------------------------------------------------------------------------------
 
 
-def _geometry(point: Tensor, derivatives: tuple[Tensor, ...]) -> SurfacePoints:
+def geometry(point: Tensor, derivatives: tuple[Tensor, ...]) -> SurfacePoints:
     gradient, *hessian = derivatives
-    size = _length(gradient)
+    size = length(gradient)
     normal = gradient / size[..., None]
     if not hessian:
         return SurfacePoints(point, gradient, normal)
     return SurfacePoints(point, gradient, normal, *_curvatures(normal, hessian[0] / size[..., None, None]))
 
 
-def _length(vectors: Tensor) -> Tensor:
+def length(vectors: Tensor) -> Tensor:
     """|v|, with a finite derivative where v is 0: there it is 1."""
     square = (vectors * vectors).sum(-1)
     return torch.where(square == 0, 1, square).sqrt()

@@ -27,11 +27,11 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Field, Relevant
-from filterlab.roots import MAX_DEGREE, all_roots
+from filterlab.roots import MAX_DEGREE
 from filterlab.surfaces.base import Hits, Surface
+from filterlab.surfaces.sheets import sheets_of
 
 RAYS_AT_ONCE = 1 << 16  # whose sheets are sorted
-_PLACES_APART = 32  # roundings of a place on a ray, up to which two are the same
 
 
 class LevelSet(Surface):
@@ -97,47 +97,14 @@ class LevelSet(Surface):
 
     def _sheets_of_part(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
         found = self.field.crossing_candidates(origins, directions, self._number)
-        within = all_roots(found.coefficients).t
-        within = torch.where(found.repeated[:, None] & (within == 0), math.inf, within)
-        jump = torch.where(found.jump, 0, torch.inf).to(within)
-        every = found.t(torch.cat((jump[:, None], within), 1))
-        hit = every < math.inf
-        ray = found.ray[:, None].expand_as(every)[hit]
-        ray, t = _told_apart(ray, every[hit], self._extent / directions.abs().amax(-1).double())
-        empty = origins.new_full((len(origins), sheets), math.inf, dtype=torch.float64)
-        return _in_order(ray, t, empty, farthest)
+        extent = self._extent / directions.abs().amax(-1).double()
+        return sheets_of(found, extent, sheets, farthest)
 
     @cached_property
     def _extent(self) -> float:
         """The diagonal of the domain, in the world."""
         corners = self.domain.corners()
         return float((corners - corners[:1]).norm(dim=-1).max())
-
-
-def _told_apart(ray: Tensor, t: Tensor, extent: Tensor) -> tuple[Tensor, Tensor]:
-    """Rays and t (M,), ray by ray, in order: of hits that rounding alone has apart the first.
-
-    Many pieces can meet in a vertex of a partition, some of them no longer than rounding: where the level is that of
-    the vertex, signs of values in them tell nothing. `extent` (R,) is that of the domain, in units of the direction.
-    """
-    order = t.argsort(stable=True)
-    order = order[ray[order].argsort(stable=True)]
-    ray, t = ray[order], t[order]
-    again = torch.zeros_like(ray, dtype=torch.bool)
-    near = t[1:] - t[:-1] <= _PLACES_APART * torch.finfo(t.dtype).eps * (t + extent[ray])[1:]
-    again[1:] = near & (ray[1:] == ray[:-1])
-    return ray[~again], t[~again]
-
-
-def _in_order(ray: Tensor, t: Tensor, empty: Tensor, farthest: bool) -> Tensor:
-    """(R, k): hits of rays in order, or from the last on, in the places of `empty`."""
-    if farthest:
-        ray, t = ray.flip(0), t.flip(0)
-        order = ray.argsort(stable=True)
-        ray, t = ray[order], t[order]
-    rank = torch.arange(len(ray), device=ray.device) - torch.searchsorted(ray, ray)
-    fits = rank < empty.shape[1]
-    return empty.index_put((ray[fits], rank[fits]), t[fits])
 
 
 def _checked(field: Field) -> Field:

@@ -7,14 +7,18 @@ not.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from filterlab.bernstein import multi_indices
+from filterlab.fields.base import Field
+from filterlab.fields.tetrahedral_pieces import FieldOnTetrahedra
 from filterlab.ops.tree import Boxes
-from filterlab.surfaces.bounds import Bounds, check_positive, check_rows
+from filterlab.surfaces.bounds import Bounds, Tetrahedra, check_positive, check_rows
 
 _ROOM = 1.01  # what fits in a ball is not cut by it
 _FLAT = 1e-12  # of the product of half axes, a volume that is none
@@ -104,6 +108,28 @@ def discs(centers: Tensor, normals: Tensor, radii: Tensor) -> Kind:
     bounds = Bounds(centers.detach().double(), radii.detach().double(), boxes=Boxes(lower, upper))
     A = along.new_zeros(len(along), 3, 3)
     return Kind(A, along / (2 * radii[:, None]), torch.zeros_like(radii), bounds, centers)
+
+
+def level_set(field: Field, level: float) -> Kind:
+    """See `Quadrics.of_level_set`."""
+    if not isinstance(field, FieldOnTetrahedra) or (spline := field.scheme.spline).degree != 2 or spline.period != 1:
+        raise TypeError(f"quadrics are the pieces of quadratic super splines (method 'qss'); got {field!r}")
+    if not math.isfinite(level):
+        raise ValueError(f"level must be a finite number; got {level!r}")
+    corners, coefficients = field.relevant_tetrahedra(level)
+    some = (coefficients != coefficients[:, :1]).any(1)
+    corners, coefficients = corners[some], coefficients[some]
+    if not len(corners):
+        raise ValueError(f"no piece of this field has the level {level:g}")
+    place = {alpha: n for n, alpha in enumerate(multi_indices(2, 3))}
+    unit = [tuple(int(i == k) for i in range(4)) for k in range(4)]
+    pairs = [[place[tuple(a + b for a, b in zip(p, q, strict=True))] for q in unit] for p in unit]
+    blossom = coefficients[:, pairs]  # f = λ·B λ
+    rows = torch.linalg.inv((corners[:, 1:] - corners[:, :1]).mT)
+    slopes = torch.cat((-rows.sum(1, keepdim=True), rows), 1)  # λ = ¼ + slopes y, y from the middle
+    along = (blossom[..., None] * slopes[:, None]).sum(2)
+    A = (slopes[:, :, :, None] * along[:, :, None]).sum(1)
+    return Kind(A, along.sum(1) / 4, blossom.sum((1, 2)) / 16 - level, Tetrahedra(corners), corners.mean(1))
 
 
 def joined(parts: Sequence[Kind]) -> Kind:

@@ -23,20 +23,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from filterlab.fields.base import Domain
-from filterlab.ops import quadrics as described
-from filterlab.ops.differentiable import quadrics as ops
+from filterlab.fields.base import Field
+from filterlab.ops import quadrics as description
 from filterlab.surfaces import quadric_kinds as kinds
-from filterlab.surfaces.base import Hits, Surface
 from filterlab.surfaces.bounds import Bounds, check_rows
+from filterlab.surfaces.in_tree import InTree, domain_around
 
 _ROUNDINGS = 16  # of the largest coordinate, by which bounds are larger: neighbours that share a face leave no gap
 _SEEN = 1e-12  # of the terms of a test, by which it has to fail
-_MARGIN = 1e-4  # of the diagonal, around all: rays begin outside of what they hit
-_FINEST = 1e-3  # of the diagonal: as the smallest radius counts what is smaller
 
 
-class Quadrics(Surface):
+class Quadrics(InTree[description.Quadrics]):
     """Surfaces y·A y + 2 b·y + c = 0, y = x − o, each within its bounds.
 
     Args:
@@ -56,9 +53,6 @@ class Quadrics(Surface):
             that are both 0, of which nothing is a surface.
     """
 
-    max_order = 2
-    in_pieces = True
-
     def __init__(
         self,
         A: Tensor,
@@ -72,16 +66,15 @@ class Quadrics(Surface):
     ) -> None:
         if not isinstance(bounds, Bounds):
             raise TypeError(f"bounds must be Spheres, Tetrahedra or Planes; got {type(bounds).__name__}")
-        if faces not in described.FACES:
-            raise ValueError(f"faces must be one of {', '.join(described.FACES)}; got {faces!r}")
+        if faces not in description.FACES:
+            raise ValueError(f"faces must be one of {', '.join(description.FACES)}; got {faces!r}")
         count = len(bounds)
         self.A, self.b = check_rows("A", A, (count, 3, 3)), check_rows("b", b, (count, 3))
         self.c = check_rows("c", c, (count,))
         self.origins = b.new_zeros(count, 3) if origins is None else check_rows("origins", origins, (count, 3))
         self.bounds, self.faces = bounds if cuts is None else bounds.cut(cuts), faces
         self._check()
-        self.domain = _domain(self.bounds)
-        self._built: tuple[tuple[int, ...], described.Quadrics] | None = None
+        self.domain = domain_around(self.bounds.boxes, self.bounds.radii)
 
     def _check(self) -> None:
         if not len(self):
@@ -163,6 +156,24 @@ class Quadrics(Surface):
         return cls(*kinds.joined(parts), faces=faces)
 
     @classmethod
+    def of_level_set(cls, field: Field, level: float, *, faces: str = "both") -> Quadrics:
+        """The level set of a quadratic super spline as quadrics in its tetrahedra: F = f − level.
+
+        Args:
+            field: of the method `qss`, unbatched.
+            level: a finite number.
+            faces: as of `Quadrics`; outside is where values are greater, as of a `LevelSet`, which shows the same and
+                stores nothing for it.
+
+        Where a piece is on the level everywhere nothing is hit. Raises TypeError, ValueError: another field; a level
+        that no piece has. No derivatives in what the field is made of: a `LevelSet` has them.
+
+        Source: Stoll, Gumhold & Seidel, Incremental raycasting of piecewise quadratic surfaces on the GPU, 2006,
+        sections 5 and 6.
+        """
+        return cls(*kinds.level_set(field, level), faces=faces)
+
+    @classmethod
     def joined(cls, parts: Sequence[Quadrics]) -> Quadrics:
         """All in one surface; pieces are numbered one part after the other. Raises ValueError: faces that differ."""
         faces = {part.faces for part in parts}
@@ -199,35 +210,14 @@ class Quadrics(Surface):
     def device(self) -> torch.device:
         return self.bounds.centers.device
 
-    @property
-    def detached(self) -> Quadrics:
-        other = self.with_tensors([x.detach() for x in self.tensors])
-        other._built = tuple(x._version for x in other.tensors), self._cast
-        return other
-
-    def _first(self, origins: Tensor, directions: Tensor) -> Hits:
-        t, piece = ops.hits(self._cast, origins.reshape(-1, 3), directions.reshape(-1, 3), 1)
-        return Hits(t[:, 0], piece[:, 0])
-
-    def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        return Hits(*ops.hits(self._cast, origins, directions, sheets, farthest))
-
     # --- what is cast ---
 
-    @property
-    def _cast(self) -> described.Quadrics:
-        """The index and the numbers in it, as they are now."""
-        versions = tuple(x._version for x in self.tensors)
-        if self._built is None or self._built[0] != versions:
-            self._built = versions, self._described()
-        return self._built[1]
-
-    def _described(self) -> described.Quadrics:
+    def _described(self) -> description.Quadrics:
         bounds, (lower, upper) = self.bounds, self.bounds.boxes.around()
         slack = _ROUNDINGS * torch.finfo(torch.float64).eps * torch.maximum(lower.abs(), upper.abs()).amax()
         planes = bounds.planes.clone()
         planes[..., 3] += (planes[..., :3] * bounds.centers[:, None]).sum(-1) - slack
-        return described.Quadrics.of(
+        return description.Quadrics.of(
             bounds.boxes, self._about_centers(), bounds.centers, bounds.radii + slack, planes, self.faces
         )
 
@@ -250,13 +240,11 @@ class Quadrics(Surface):
         """
         if self.faces == "both":
             return self
-        found = self._cast.some(self._facing(eye.detach().to(self.bounds.centers)))
-        other = copy.copy(self)
-        other._built = tuple(x._version for x in self.tensors), found
-        return other
+        return self._casting(self.described.some(self.facing(eye)))
 
-    def _facing(self, eye: Tensor) -> Tensor:
-        """(M,) whether some point of the bounds may face it."""
+    def facing(self, eye: Tensor) -> Tensor:
+        """(M,) whether some point within the bounds may show the side that counts to a world point (3,)."""
+        eye = eye.detach().to(self.bounds.centers)
         sign = 1 if self.faces == "front" else -1
         A, b, c = (sign * x for x in self._about_centers())
         e = eye - self.bounds.centers
@@ -268,12 +256,3 @@ class Quadrics(Surface):
             reach = torch.minimum(reach, (corners * polar[:, None]).sum(-1).amax(1))
         size = c.abs() + own.abs() + reach.abs()
         return c + own + reach >= -_SEEN * size
-
-
-def _domain(bounds: Bounds) -> Domain:
-    """A box around all, with room; the smallest radius stands for a voxel."""
-    lower, upper = (x.cpu() for x in bounds.boxes.around())
-    diagonal = float((upper - lower).norm())
-    lower, upper = lower - _MARGIN * diagonal, upper + _MARGIN * diagonal
-    finest = max(float(bounds.radii.min()), _FINEST * diagonal)
-    return Domain(tuple(lower.tolist()), tuple(upper.tolist()), voxel_size=finest)

@@ -44,6 +44,13 @@ def scan(tmp_path):
     return path
 
 
+def ridge(path):
+    """Heights 5 apart, from 0 to 30."""
+    y, x = np.mgrid[0:11, 0:10] / 10.0
+    fl.save_heights(fl.Heights(30 * np.exp(-8 * (x - y) ** 2), (5.0, 5.0)), path)
+    return path
+
+
 def tiny(name, scan):
     """The smallest sensible config of every experiment."""
     volume_view = {**VIEW, "transfer": {"peaks": [{"center": 120, "width": 90, "height": 0.5, "color": [1, 1, 1]}]}}
@@ -55,6 +62,7 @@ def tiny(name, scan):
             "markers": 9,
             "dimensions": [1],
         },
+        "terrain_error": {"splines": ["linear", "c1", "c2 prefiltered"], "steps": [12, 24], "points": 50},
         "partitions": {"splines": ["quadratic-c1", "qss"], "fineness": 2},
         "rms_error": {
             "studies": [{"signal": "gaussian", "resolutions": [4, 6], "fit_from": 4}],
@@ -177,6 +185,36 @@ def tiny(name, scan):
         "views": {"training": 2, "held_out": 1, "size": 6, "shown": 8, "at_once": 1},
         "descent": {"iterations": 2, "learning_rate": 0.01},
     }
+    configs["inverse_terrain"] = {
+        "samples": 7,
+        "views": {"count": 2, "size": 6, "shown": 8},
+        "descent": {"iterations": 2, "learning_rate": 0.05},
+    }
+    configs["terrain_quality"] = {
+        "splines": ["linear", "c1"],
+        "reference": {"spline": "linear", "steps": 20},
+        "points": 200,
+        "size": [12, 8],
+        "subpixels": 1,
+    }
+    configs["terrain_views"] = {
+        "places": [
+            {
+                "title": "a ridge",
+                "heights": str(ridge(scan.with_name("ridge.npz"))),
+                "views": [
+                    {"title": "as it is", "scene": {"size": [12, 8], "subpixels": 1}},
+                    {
+                        "title": "a flight",
+                        "scene": {"size": [12, 8], "subpixels": 1, "haze": 500},
+                        "flight": {"points": [[5, 30, 20], [40, 35, 20]]},
+                        "frames": 2,
+                    },
+                ],
+            },
+            {"title": "none", "heights": {"file": "not_here.tif", "optional": True}, "views": [{"title": "none"}]},
+        ]
+    }
     configs["silhouettes"] = {
         "methods": ["trilinear"],
         "volumes": ["ball"],
@@ -190,6 +228,17 @@ def tiny(name, scan):
         "rows": 2,
         "repeats": 2,
     }
+    configs["quadrics_numerics"] = {
+        "dtypes": ["float32"],
+        "alphas": [1, 1e-6],
+        "distances": [30],
+        "heights": [1, 1e-4],
+        "covers": [100],
+        "offsets": [0, 0.5],
+        "count": 500,
+        "quadrics": 60,
+        "points": 2,
+    }
     configs["root_finding"] = {
         "families": ["random", "double", "root-at-end"],
         "degrees": [4, 5],
@@ -199,6 +248,12 @@ def tiny(name, scan):
         "exact": 5,
         "chunk": 25,
     }
+    configs["terrain_roots"] = {
+        "families": ["grazing rays", "rays at the C1 terrain"],
+        "dtypes": ["float32", "float64"],
+        "count": 12,
+    }
+    configs["terrain_frames"] = {"splines": ["c1"], "sizes": [16, 32], "angles": [30], "pixels": 6, "seconds": 0.01}
     configs["hit_error"] = {
         "studies": [{"signal": "torus", "level": 0, "resolutions": [8, 12], "fit_from": 8}],
         "methods": ["trilinear", {"name": "trilinear", "gradient": "central"}, "triquadratic"],
@@ -271,6 +326,20 @@ def tiny(name, scan):
         "scale": 0.5,
         "points": 20,
         "seconds": 0,
+    }
+    configs["quadrics_tables"] = {
+        "covers": [80],
+        "sets": [100],
+        "sizes": [[12, 10]],
+        "rays": 30,
+        "quadrics": 8,
+        "seconds": 0,
+    }
+    configs["inverse_slim"] = {
+        "target_balls": 100,
+        "balls": 60,
+        "views": {"training": 2, "held_out": 1, "size": 6, "shown": 8, "at_once": 1},
+        "descent": {"iterations": 2, "learning_rate": 0.01},
     }
     parts = {n: {"experiment": n, "description": f"tiny {n}", **c} for n, c in configs.items()}
     parts["demo"] = {"experiment": "demo", "description": "tiny", "sections": [parts["rms_error"], parts["dvr_volume"]]}

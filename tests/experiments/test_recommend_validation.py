@@ -26,7 +26,8 @@ GOOD = candidate("tricubic", 2.0, 0.0005, 0.002)
 def answer(pick: Candidate | None, *others: Candidate) -> Recommendation:
     candidates = tuple(sorted({pick, *others} - {None}, key=lambda c: c.seconds))
     asked = {"task": "resample", "max_error": 0.01, "max_memory": math.inf, "max_time": math.inf}
-    found = {"value_range": (0.0, 1.0), "candidates": candidates, "pick": pick, "best": candidates[-1]}
+    best = candidates[-1]
+    found = {"value_range": (0.0, 1.0), "candidates": candidates, "pick": pick, "best": best, "of_value": best.error}
     return Recommendation(**asked, boundary="mirror", nan="refuse", **found)
 
 

@@ -350,6 +350,24 @@ def test_nifti_keeps_version_codes_and_units(tmp_path: Path, kind: type, sform: 
         assert np.allclose(image.get_qform(), done.affine, atol=1e-4)
 
 
+@pytest.mark.parametrize("kind", [nibabel.Nifti1Image, nibabel.Nifti2Image])
+@pytest.mark.parametrize(("code", "kept"), [(3, True), (1001, True), (1002, True), (1007, False), (0, True)])
+def test_nifti_keeps_description_and_intent(tmp_path: Path, kind: type, code: int, kept: bool) -> None:
+    image = kind(np.arange(24, dtype=np.int16).reshape(4, 3, 2), OBLIQUE)
+    image.header["intent_code"], image.header["intent_name"], image.header["intent_p1"] = code, b"of t", 7.5
+    image.header["descrip"] = "Köpfe".encode("latin-1")
+    nibabel.save(image, tmp_path / "a.nii")
+    volume = load_volume(tmp_path / "a.nii")
+    nearest, floating = resample(volume, "nearest", shape=(3, 5, 7)), volume.to(torch.float32)
+    for work, whole in ((volume, True), (nearest, True), (floating, False)):
+        save_volume(work, tmp_path / "b.nii.gz")
+        found = nibabel.load(tmp_path / "b.nii.gz").header
+        assert bytes(found["descrip"].tobytes()).rstrip(b"\0") == "Köpfe".encode("latin-1")
+        told = (code, b"of t", 7.5) if kept and code and (whole or code != 1002) else (0, b"", 0.0)
+        name = bytes(found["intent_name"].tobytes()).rstrip(b"\0")
+        assert (int(found["intent_code"]), name, float(found["intent_p1"])) == told
+
+
 def test_nifti_whose_forms_tell_different_places_keeps_both(tmp_path: Path) -> None:
     volume = load_volume(nifti(tmp_path / "a.nii", 4, 1, ELSEWHERE))
     assert np.allclose(volume.affine, OBLIQUE, atol=1e-5)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import sys
+import tracemalloc
 from pathlib import Path
 
 import nibabel
@@ -598,3 +599,34 @@ def test_real_scans_equal_what_other_readers_find() -> None:
             image = nibabel.load(path)
             assert (volume.samples.numpy() == np.asarray(image.dataobj).T).all()
             assert (image.affine == volume.affine).all()
+
+
+@pytest.mark.parametrize(
+    ("ending", "dtype"),
+    [
+        *((ending, "uint16") for ending in (".npy", ".npz", ".nrrd", ".nrrd.gz", ".nii", ".nii.gz")),
+        *((".npy", ">u2"), (".npz", ">u4"), (".nrrd", "uint32"), (".nrrd.gz", "uint32")),
+    ],
+)
+def test_wider_integers_are_made_in_the_memory_that_they_take(tmp_path: Path, ending: str, dtype: str) -> None:
+    """Not beside what was read, which took half as much again."""
+    samples = (np.arange(6_000_000) // 50).reshape(200, 300, 100).astype(dtype)
+    samples[-1, -1, -3:] = np.iinfo(dtype).max, 0, np.iinfo(dtype).max - 1
+    path = tmp_path / ("a" + (ending.removesuffix(".gz") if "nrrd" in ending else ending))
+    if ending == ".npy":
+        np.save(path, samples)
+    elif ending == ".npz":
+        np.savez_compressed(path, samples=samples)
+    elif "nrrd" in ending:
+        write_nrrd(path, samples, encoding="gzip" if ending.endswith("gz") else "raw")
+    else:
+        nibabel.save(nibabel.Nifti1Image(samples.T, np.eye(4)), path)
+    wide = 2 * samples.nbytes
+    load_volume(path)  # imports are not counted
+    tracemalloc.start()
+    volume = load_volume(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert np.array_equal(volume.samples.numpy(), samples)
+    assert volume.samples.nbytes == wide
+    assert wide <= peak < 1.2 * wide  # 1.5 times as much before

@@ -21,7 +21,7 @@ from filterlab.volume import Boundary
 from tests.laws import assert_close
 
 QUADRATIC = Stencil.jet(bspline(2), 1)
-PLACE = Placement(Geometry.of(2.0), Boundary.MIRROR, (5, 6, 7), 0, 0.5)
+PLACE = Placement(Geometry.of(2.0), Boundary.MIRROR, (5, 6, 7), 0, (0.5, 17.0, 0.0))
 
 
 def some(*shape: int) -> torch.Tensor:

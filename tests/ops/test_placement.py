@@ -24,7 +24,7 @@ GEOMETRIES = {
 PLACES = [
     Placement(geometry, boundary, size, tail, shift)
     for geometry, boundary, (size, tail, shift) in product(
-        GEOMETRIES.values(), Boundary, [((5, 1, 2), 0, 0.0), ((7, 8, 100), 3, 0.5)]
+        GEOMETRIES.values(), Boundary, [((5, 1, 2), 0, (0.0, 0.0, 0.0)), ((7, 8, 100), 3, (0.5, 17.0, 0.5))]
     )
 ]
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
+from itertools import combinations, pairwise
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ from torch import Tensor
 from filterlab import signals
 from filterlab.methods import reconstruct
 from filterlab.render import PerspectiveCamera, TransferFunction, render
+from filterlab.render.suggestion import _last_bins
 from filterlab.volume import Volume
 from filterlab.world import World
 
@@ -119,3 +122,21 @@ def test_signals_are_fields_too() -> None:
     image = render(signal, camera, transfer, size=(12, 12))
     assert transfer.unit == signal.domain.voxel_size
     assert 0.1 < image[..., 3].mean() < 1
+
+
+@pytest.mark.parametrize("classes", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", range(4))
+def test_classes_of_a_histogram_have_the_largest_variance_between_them(seed: int, classes: int) -> None:
+    """Of all ways to cut it, in rational arithmetic; a third of the bins are empty."""
+    draw = torch.Generator().manual_seed(seed)
+    counts = torch.randint(0, 30, (11,), generator=draw) * (torch.rand(11, generator=draw) > 0.35)
+    numbers = [int(n) for n in counts]
+
+    def between(last: tuple[int, ...]) -> Fraction:
+        parts = [range(i, j) for i, j in pairwise((0, *(b + 1 for b in last), 11))]
+        sums = [(sum(numbers[b] for b in part), sum(numbers[b] * b for b in part)) for part in parts]
+        return sum((Fraction(s * s, n) for n, s in sums if n), Fraction(0))
+
+    found = tuple(_last_bins(counts.double(), torch.arange(11.0).double(), classes).tolist())
+    assert len(found) == classes - 1
+    assert between(found) == max(map(between, combinations(range(10), classes - 1)))

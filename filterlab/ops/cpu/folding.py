@@ -36,7 +36,7 @@ FIELDS: dict[str, type] = {
     "count": ctypes.c_int64,  # M
     "chunk": ctypes.c_int64,  # packs of a chunk
     "chunks": ctypes.c_int64,
-    "shift": ctypes.c_double,
+    **{f"shift_{a}": ctypes.c_double for a in AXES},
     **{f"origin_{a}": ctypes.c_double for a in AXES},
     **{f"matrix_{a}{b}": ctypes.c_double for a in AXES for b in AXES},  # row a: voxel coordinate a
     **{f"low_{a}": ctypes.c_double for a in AXES},
@@ -104,8 +104,8 @@ class _Program:
             e.copy(self.copied[0], own[0], size)
         points, located, signs = (b.select(partial, c, o) for c, o in zip(self.copied, own, strict=True))
         folded = [self._fold(x, axis) for axis, x in enumerate(self._to_voxel(e.load_triples(points)))]
-        shift = e.everywhere(e.scalar(j.shift))
-        e.store_triples([e.subtract(x, shift) for x, _ in folded], located)
+        shifts = [e.everywhere(e.scalar(getattr(j, f"shift_{a}"))) for a in AXES]
+        e.store_triples([e.subtract(x, s) for (x, _), s in zip(folded, shifts, strict=True)], located)
         if self.variant.signs:
             e.store_triples([sign for _, sign in folded], signs)
         with b.if_then(partial, likely=False):

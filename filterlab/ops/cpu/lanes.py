@@ -206,6 +206,10 @@ class Lanes:
         kind = ir.VectorType(ir.IntType(self.bits), self.count)
         return ir.Constant(kind, [value] * self.count)
 
+    def integers_32(self, value: int) -> Value:
+        """The same integer of 32 bits in every lane."""
+        return ir.Constant(ir.VectorType(I32, self.count), [value] * self.count)
+
     def to_bits_size(self, a: Value) -> Value:
         """Whole numbers (below 2⁵¹) to integers as large as a number of the arithmetic."""
         if self.bits == 32:

@@ -81,9 +81,10 @@ class Placing:
 def _job(placement: Placement) -> FoldingJob:
     """With everything but addresses and what the number of points decides."""
     geometry = placement.geometry
-    job = FoldingJob(shift=placement.shift)
+    job = FoldingJob()
     for i, (a, n) in enumerate(zip(AXES, placement.size, strict=True)):
         setattr(job, f"origin_{a}", geometry.origin[i])
+        setattr(job, f"shift_{a}", placement.shift[i])
         low, high = placement.boundary.interval(n, placement.tail)
         setattr(job, f"low_{a}", low)
         setattr(job, f"high_{a}", high)

@@ -33,7 +33,7 @@ def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidate
     """`ops.reference.raycast.candidates`, fused."""
 
     def write(rays: Tensor, capacity: int) -> Written:
-        written = Written.room(given, len(rays), capacity)
+        written = Written.room(len(rays), capacity, given.lattice.degree, given.dtype, origins.device)
         if not len(rays):
             return written
         cast = _Cast(given, "candidates", origins[rays], directions[rays])
@@ -41,7 +41,7 @@ def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidate
         cast.run(**written._asdict())
         return written
 
-    return written_in_parts(write, given, len(origins))
+    return written_in_parts(write, given.lattice.degree, len(origins), origins.device)
 
 
 class _Cast:

@@ -31,11 +31,11 @@ def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidate
     """`ops.reference.raycast.candidates`, fused."""
 
     def write(rays: Tensor, capacity: int) -> Written:
-        written = Written.room(given, len(rays), capacity)
+        written = Written.room(len(rays), capacity, given.lattice.degree, given.dtype, origins.device)
         _cast(given, "candidates", origins[rays], directions[rays], written._asdict(), capacity)
         return written
 
-    return written_in_parts(write, given, len(origins))
+    return written_in_parts(write, given.lattice.degree, len(origins), origins.device)
 
 
 def _cast(

@@ -77,21 +77,23 @@ def placement_text(placement: Placement) -> str:
 def placement_of(text: str) -> Placement:
     matrix, origin, boundary, size, tail, shift = json.loads(text)
     geometry = Geometry(tuple(map(tuple, matrix)), tuple(origin))
-    return Placement(geometry, Boundary(boundary), tuple(size), tail, shift)
+    return Placement(geometry, Boundary(boundary), tuple(size), tail, tuple(shift))
 
 
 @constant
-def filtering_text(prefilter: str | Prefilter, boundary: str | Boundary, tail: int) -> str:
-    """A prefilter along x, y and z as JSON; `filtering_of` is the inverse."""
+def filtering_text(
+    prefilter: str | Prefilter, boundary: str | Boundary, tail: int, dims: tuple[int, ...] = VOLUME
+) -> str:
+    """A prefilter along some axes as JSON; `filtering_of` is the inverse."""
     own = named(prefilter)
-    return json.dumps([own.name, [[str(c) for c in f] for f in own.factors], Boundary.named(boundary), tail])
+    return json.dumps([own.name, [[str(c) for c in f] for f in own.factors], Boundary.named(boundary), tail, dims])
 
 
 @lru_cache(maxsize=1024)
 def filtering_of(text: str) -> Filtering:
-    name, factors, boundary, tail = json.loads(text)
+    name, factors, boundary, tail, dims = json.loads(text)
     own = Prefilter(name, tuple(tuple(Fraction(c) for c in factor) for factor in factors))
-    return Filtering(VOLUME, own, Boundary(boundary), tail)
+    return Filtering(tuple(dims), own, Boundary(boundary), tail)
 
 
 # --- gather -----------------------------------------------------------------------------------------------------------
@@ -205,15 +207,16 @@ place.register_autograd(_place_backward, setup_context=_keep_place)
 
 @custom_op("filterlab::prefilter", mutates_args=())
 def prefilter(samples: Tensor, how: str, implementation: str) -> Tensor:
-    """`ops.prefilter_samples` of a filter given as text."""
+    """`ops.prefilter_samples` or `ops.prefilter_axis` of a filter given as text."""
     return _own(filters.evaluate(samples, filtering_of(how), implementation), samples)
 
 
 @prefilter.register_fake
 def _(samples: Tensor, how: str, implementation: str) -> Tensor:
-    *batch, d, h, w = samples.shape
-    beyond, dtype = 2 * filtering_of(how).tail, torch.promote_types(samples.dtype, torch.float32)
-    return samples.new_empty((*batch, d + beyond, h + beyond, w + beyond), dtype=dtype)
+    shape, filtering = list(samples.shape), filtering_of(how)
+    for dim in filtering.dims:
+        shape[dim] += 2 * filtering.tail
+    return samples.new_empty(shape, dtype=torch.promote_types(samples.dtype, torch.float32))
 
 
 def _keep_prefilter(ctx, inputs, output) -> None:

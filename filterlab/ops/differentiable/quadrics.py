@@ -1,4 +1,7 @@
-"""Casting rays at quadrics: what runs it. Derivatives of hits are `surfaces.base`'s, once for all surfaces."""
+"""Casting rays at quadrics, and at whatever else stands in the leaves of a tree: what runs it.
+
+Derivatives of hits are `surfaces.base`'s, once for all surfaces.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,10 @@ from torch import Tensor
 from filterlab.ops import cpu
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import transforming
-from filterlab.ops.quadrics import Quadrics
+from filterlab.ops.quadrics import InLeaves
 
 
-def missing(given: Quadrics, origins: Tensor) -> str | None:
+def missing(given: InLeaves, origins: Tensor) -> str | None:
     """What keeps the program from running here; None: nothing does."""
     if transforming():
         return "it has no transforms of torch.func"
@@ -22,19 +25,23 @@ def missing(given: Quadrics, origins: Tensor) -> str | None:
 
 
 def hits(
-    given: Quadrics,
+    given: InLeaves,
     origins: Tensor,
     directions: Tensor,
     sheets: int,
     farthest: bool = False,
     implementation: str | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """t (R, k) float64 of the first hits of rays (R, 3), or the last ones, and which quadrics they hit (R, k) int64.
+    """t (R, k) float64 of the first hits of rays (R, 3), or the last ones, and what they hit (R, k) int64.
 
     Args:
         sheets, farthest: k hits in order, or from the last on; t is ∞, the number −1 where there are no more.
-        implementation: "reference" or "cpu"; None: the faster one that can run.
+        implementation: "reference", "cpu" or "cuda"; None: the fastest that can run.
     """
-    if implementation is None:
-        implementation = "cpu" if missing(given, origins) is None else "reference"
-    return driver(implementation, "quadrics").hits(given, origins, directions, sheets, farthest)
+    driven = driver(implementation or implementation_for(given, origins), given.op)
+    return driven.hits(given, origins, directions, sheets, farthest)
+
+
+def implementation_for(given: InLeaves, origins: Tensor) -> str:
+    """What casts these rays unasked: "cpu" on the CPU, else plain torch. "cuda" has only run in the interpreter yet."""
+    return "cpu" if missing(given, origins) is None else "reference"

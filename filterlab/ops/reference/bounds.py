@@ -52,8 +52,8 @@ def layers_of(lattice: AnyLattice, edge: int) -> Iterator[tuple[Tensor, Tensor]]
         slab = values.narrow(0, first, cells + sz - 1).double()
         hull = lattice.scale * _hull(slab, lattice) + lattice.shift
         low = high = hull
-        for dim, own in enumerate(reversed(_columns(lattice))):
-            asked = dim, own * edge, int(lattice.continuous)
+        for dim, (own, shared) in enumerate(reversed(_columns(lattice))):
+            asked = dim, own * edge, shared
             low, high = over_windows(torch.amin, low, *asked), over_windows(torch.amax, high, *asked)
         yield low, high
 
@@ -73,13 +73,16 @@ def _layers_of_cubes(lattice: TetrahedralLattice, edge: int) -> Iterator[tuple[T
 def _cells_at_once(lattice: Lattice) -> int:
     if lattice.coefficients.device.type == "cpu":
         return _AT_ONCE
-    a_layer = math.prod(n * own for n, own in zip(lattice.cells, _columns(lattice), strict=True)) // lattice.cells[2]
+    a_layer = math.prod(n * own for n, (own, _) in zip(lattice.cells, _columns(lattice), strict=True))
+    a_layer //= lattice.cells[2]
     return max(_AT_ONCE, _NUMBERS_AT_ONCE // a_layer)
 
 
-def _columns(lattice: Lattice) -> list[int]:
-    """Coefficients along x, y, z that a cell has of its own: its last one is the next cell's first where both agree."""
-    return [p if lattice.continuous else p + 1 for p in lattice.degrees]
+def _columns(lattice: Lattice) -> list[tuple[int, int]]:
+    """Coefficients along x, y, z that a cell has of its own, and that it shares: where both agree its last one is the
+    next cell's first. Of degree 0 it has but one."""
+    shared = [int(lattice.continuous and p > 0) for p in lattice.degrees]
+    return [(p + 1 - both, both) for p, both in zip(lattice.degrees, shared, strict=True)]
 
 
 def _hull(slab: Tensor, lattice: Lattice) -> Tensor:
@@ -87,7 +90,7 @@ def _hull(slab: Tensor, lattice: Lattice) -> Tensor:
     total = torch.zeros((), dtype=slab.dtype, device=slab.device)
     for product in lattice.row:
         part = slab
-        for axis, own in enumerate(_columns(lattice)):
+        for axis, (own, _) in enumerate(_columns(lattice)):
             part = _along(part, 2 - axis, weights_of(product, axis, lattice).to(slab.device), own)
         total = total + product.weight * part
     return total

@@ -19,7 +19,9 @@ def place(points: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         placement.boundary.fold(x, n, placement.tail) for x, n in zip(voxels.unbind(-1), placement.size, strict=True)
     ]
     located = torch.stack([x for x, _ in axes], -1)
-    return located - placement.shift if placement.shift else located, torch.stack([s for _, s in axes], -1)
+    if any(placement.shift):
+        located = located - located.new_tensor(placement.shift)
+    return located, torch.stack([s for _, s in axes], -1)
 
 
 def _voxels(points: Tensor, placement: Placement) -> Tensor:

@@ -17,7 +17,8 @@ top, and those behind a ray's last hit are dropped: memory does not grow with th
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -32,13 +33,18 @@ from filterlab.ops.quadrics import (
     SMALLEST,
     SQUARE,
     VECTOR,
+    InLeaves,
     Kept,
     Quadrics,
     Rays,
+    in_parts,
 )
 
 PAIRS_AT_ONCE = 1 << 14  # of rays and nodes, or leaves
 _RAYS_AT_ONCE = 1 << 18
+
+Meets = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Kept, bool], Tensor]
+"""What `intersections` is, of whatever is in leaves."""
 
 
 def hits(
@@ -49,21 +55,46 @@ def hits(
     Returns:
         t, and numbers of the quadrics (R, k) int64, −1 where none is hit.
     """
-    parts = zip(origins.split(_RAYS_AT_ONCE), directions.split(_RAYS_AT_ONCE), strict=True)
-    found = [_of_part(given, o, d, sheets, farthest) for o, d in parts]
-    t, piece = zip(*found, strict=True)
-    return torch.cat(t), torch.cat(piece)
+    return walked(given, intersections, origins, directions, sheets, farthest)
+
+
+def walked(
+    given: InLeaves, meets: Meets, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
+) -> tuple[Tensor, Tensor]:
+    """The same of whatever is in the leaves of a tree, and meets rays as that function says."""
+    cast = lambda o, d: _of_part(given, meets, o, d, sheets, farthest)  # noqa: E731
+    t, piece = in_parts(cast, origins, directions, _RAYS_AT_ONCE)
+    return t, piece
 
 
 def _of_part(
-    given: Quadrics, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
+    given: InLeaves, meets: Meets, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
 ) -> tuple[Tensor, Tensor]:
     rays = Rays.of(given.tree, origins, directions, farthest)
     table = _Table.of_rays(rays, sheets)
+    walk(given, meets, rays, table)
+    return rays.t(table.tau), given.tree.numbers(table.place)
+
+
+class Taking(Protocol):
+    """Who is told of hits on a walk."""
+
+    @property
+    def limit(self) -> Tensor:
+        """τ (R,): hits behind it need not be told."""
+        ...
+
+    def take(self, ray: Tensor, tau: Tensor, place: Tensor) -> None:
+        """Hits (M,) in no order: numbers of rays, τ, and places of what is hit."""
+        ...
+
+
+def walk(given: InLeaves, meets: Meets, rays: Rays, found: Taking) -> None:
+    """Tells of every hit before its limit, the nearest leaves first, more or less."""
     stack = _Pairs.at_root(rays).split()
     while stack:
         pairs = stack.pop()
-        pairs = pairs.some(pairs.near <= table.tau[pairs.ray, -1])
+        pairs = pairs.some(pairs.near <= found.limit[pairs.ray])
         if not len(pairs.ray):
             continue
         inner = pairs.some(pairs.node >= 0)
@@ -71,8 +102,7 @@ def _of_part(
             stack += _below(given, rays, inner).split()
         leaves = pairs.some(pairs.node < 0)
         if len(leaves.ray):
-            table.take(*_in_leaves(given, rays, leaves.ray, -1 - leaves.node))
-    return rays.t(table.tau), given.tree.numbers(table.place)
+            found.take(*_in_leaves(given, meets, rays, leaves.ray, -1 - leaves.node))
 
 
 class _Pairs(NamedTuple):
@@ -99,7 +129,7 @@ class _Pairs(NamedTuple):
         return [_Pairs(*rows) for rows in zip(*(x[order].split(PAIRS_AT_ONCE) for x in self), strict=True)]
 
 
-def _below(given: Quadrics, rays: Rays, pairs: _Pairs) -> _Pairs:
+def _below(given: InLeaves, rays: Rays, pairs: _Pairs) -> _Pairs:
     """The children whose boxes are met."""
     start, along = rays.start[pairs.ray], rays.along[pairs.ray]
     along = torch.where(along.abs() < SMALLEST, SMALLEST, along)
@@ -115,11 +145,11 @@ def _below(given: Quadrics, rays: Rays, pairs: _Pairs) -> _Pairs:
     return _Pairs(pairs.ray[pair], torch.where(first < 0, first - child, first + child), near[pair, child])
 
 
-def _in_leaves(given: Quadrics, rays: Rays, ray: Tensor, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _in_leaves(given: InLeaves, meets: Meets, rays: Rays, ray: Tensor, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """All hits of rays in leaves (Q,): numbers of rays, τ, and places (M,)."""
     start, along, first, last = (x[ray] for x in (rays.start, rays.along, rays.first, rays.last))
     kept = given.kept(rays.reversed)
-    tau = intersections(given.leaves[leaf], start, along, first, last, kept, rays.reversed)
+    tau = meets(given.leaves[leaf], start, along, first, last, kept, rays.reversed)
     pair, lane, _ = hit = (tau < torch.inf).nonzero().unbind(1)
     return ray[pair], tau[hit], given.leaves.shape[-1] * leaf[pair] + lane
 
@@ -129,15 +159,20 @@ def intersections(
 ) -> Tensor:
     """τ (Q, 8, 2) where rays (Q, 3) meet the quadrics of leaves (Q, K, 8): front and back; ∞ where they don't."""
     u = along.unsqueeze(-1)
-    p = start.unsqueeze(-1) - leaf[:, CENTER]
-    behind = -(p * u).sum(1)
-    q = p + behind[:, None] * u
+    q, behind = from_center(leaf[:, CENTER], start, u)
     near, far = _clipped(leaf, q, u, first[:, None] - behind, last[:, None] - behind)
     front, back, one = _roots(leaf, q, u, far if reversed else near)
     counts = torch.stack((torch.where(one, kept.touches, kept.falls), ~one & kept.rises), -1)
     roots = torch.stack((front, back), -1)
     within = (roots >= near[..., None]) & (roots <= far[..., None])
     return torch.where(within & counts, roots + behind[..., None], torch.inf)
+
+
+def from_center(center: Tensor, start: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """q (Q, 3, 8), the points of rays (Q, 3), along u (Q, 3, 1), nearest to centres, from there; and τ of them."""
+    p = start.unsqueeze(-1) - center
+    behind = -(p * u).sum(1)
+    return p + behind[:, None] * u, behind
 
 
 def _clipped(leaf: Tensor, q: Tensor, u: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,15 +203,19 @@ def _roots(leaf: Tensor, q: Tensor, u: Tensor, entry: Tensor) -> tuple[Tensor, T
     rounding = ROUNDINGS * torch.finfo(leaf.dtype).eps
     radicand = beta * beta - alpha * gamma
     slack = rounding * (2 * beta.abs() * size_beta + size_a * gamma.abs() + alpha.abs() * size_gamma)
-    s = radicand.sqrt()
-    receding = beta > 0
-    front = torch.where(receding, -(beta + s) / alpha, gamma / (s - beta))
-    back = torch.where(receding, -gamma / (beta + s), (s - beta) / alpha)
+    front, back = stable_roots(alpha, beta, gamma, radicand.sqrt())
     touches = radicand.abs() <= slack
     on = (alpha.abs() <= rounding * size_a) & (beta.abs() <= rounding * size_beta)
     on = on & (gamma.abs() <= rounding * size_gamma)
     front = torch.where(on, entry, torch.where(touches, -beta / alpha, front))
     return front, back, on | touches
+
+
+def stable_roots(alpha: Tensor, beta: Tensor, gamma: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+    """Front and back of α ρ² + 2 β ρ + γ = 0, s = √(β² − αγ): those with α ρ + β = −s and s."""
+    receding = beta > 0
+    front = torch.where(receding, -(beta + s) / alpha, gamma / (s - beta))
+    return front, torch.where(receding, -gamma / (beta + s), (s - beta) / alpha)
 
 
 def _times(a: Tensor, x: Tensor) -> Tensor:
@@ -202,8 +241,11 @@ class _Table:
         tau = rays.first.new_full((len(rays.first), sheets), torch.inf)
         return cls(tau, torch.full_like(tau, -1, dtype=torch.int64))
 
+    @property
+    def limit(self) -> Tensor:
+        return self.tau[:, -1]
+
     def take(self, ray: Tensor, tau: Tensor, place: Tensor) -> None:
-        """Hits (M,) in no order."""
         rows = ray.unique()
         ray = torch.cat((rows.repeat_interleave(self.tau.shape[1]), ray))
         tau, place = torch.cat((self.tau[rows].flatten(), tau)), torch.cat((self.place[rows].flatten(), place))

@@ -56,6 +56,8 @@ mip: {center: 400, width: 900}
 camera: {direction: [0, 1, 0]}""",
         """volume: head.nii.gz
 slice: {axis: z, position: 31.5, colormap: bone}""",
+        """surface: {slim: bunny.npz, material: {kind: phong, color: sandybrown}}
+camera: {direction: [0, 0, -1], up: [0, 1, 0]}""",
     )
 
     description: str = ""
@@ -69,7 +71,7 @@ slice: {axis: z, position: 31.5, colormap: bone}""",
     transfer: Transfer | None = None
     """Of a medium: what its values look like."""
     surface: SurfaceModel | None = None
-    """Instead of a medium: the level set that is shown."""
+    """Instead of a medium: the level set that is shown, or a SLIM surface, without a volume."""
     mip: MipModel | None = None
     """Instead of a medium: the largest value along every ray."""
     slice: SliceModel | None = None
@@ -106,7 +108,9 @@ slice: {axis: z, position: 31.5, colormap: bone}""",
 
     @model_validator(mode="after")
     def _consistent(self) -> Scene:
-        if (self.volume is None) == (self.signal is None):
+        if self.slim is not None:
+            self._check_without_field()
+        elif (self.volume is None) == (self.signal is None):
             raise ValueError("expected either a volume or a signal" + ("; got both" if self.volume else ""))
         if self.signal is not None and self.signal.samples is None and self.method is not None:
             raise ValueError("a signal that is not sampled needs no method: give signal.samples, or leave method out")
@@ -116,6 +120,11 @@ slice: {axis: z, position: 31.5, colormap: bone}""",
         if self.transfer is not None and self.transfer.axis == "raw":  # else the values are known with the volume
             self.transfer.build(lambda: (0.0, 1.0), 1.0).to(self.dtype)
         return self
+
+    def _check_without_field(self) -> None:
+        """Raises ValueError if there is what only a field has."""
+        if unused := [name for name in ("volume", "signal", "method") if getattr(self, name) is not None]:
+            raise ValueError(f"{' and '.join(unused)}: a SLIM surface is in a file of its own; leave it out")
 
     def _check_shown(self) -> None:
         """Raises ValueError unless one thing is shown, and every key has a meaning for it."""
@@ -135,6 +144,11 @@ slice: {axis: z, position: 31.5, colormap: bone}""",
             shown = getattr(self, kind)
             if isinstance(shown, ValueColors) and shown.chosen and self.transfer is not None:
                 raise ValueError(f"expected the colours of a {kind} once; got a transfer function and its own")
+
+    @property
+    def slim(self) -> str | None:
+        """The file of the SLIM surface that is shown, if that is."""
+        return None if self.surface is None else self.surface.slim
 
     @property
     def stepped(self) -> bool:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
+from filterlab.io.covers import is_slim
 from filterlab.io.images import load_image
 from filterlab.render import materials
 from filterlab.scenes.model.colors import Color, with_opacity
@@ -148,13 +149,20 @@ MaterialModel = Annotated[PhongModel | ToonModel | ReflectionLinesModel | Enviro
 
 
 class SurfaceModel(Section):
-    """The level set of a scene's field, hit exactly; a bare number stands for its level."""
+    """The level set of a scene's field, hit exactly, or a SLIM surface; a bare number stands for a level."""
 
-    examples = ("90", "{level: 0.35, axis: normalized, material: toon, sheets: 1, shadows: true, subpixels: 2}")
+    examples = (
+        "90",
+        "{level: 0.35, axis: normalized, material: toon, sheets: 1, shadows: true, subpixels: 2}",
+        "{slim: bunny.npz, material: reflection_lines}",
+    )
     bare: ClassVar[str] = "level"
 
-    level: Annotated[float, Told(unit="of the volume's values, or parts of their range: `axis`")]
-    """The value on the surface."""
+    level: Annotated[float, Told(unit="of the volume's values, or parts of their range: `axis`")] | None = None
+    """The value on the surface; or a `slim`."""
+    slim: Annotated[str, Field(min_length=1), Told("a path")] | None = None
+    """Instead of a level, a file that `filterlab slim` wrote, looked for like a volume; it needs neither volume nor
+    method."""
     axis: Literal["raw", "normalized"] = "raw"
     """`raw`: a value of the volume; `normalized`: 0 … 1 stand for its smallest and largest sample."""
     material: Annotated[MaterialModel, BeforeValidator(_of_kind)] = PhongModel()
@@ -171,8 +179,28 @@ class SurfaceModel(Section):
     def _from_level(cls, value: Any) -> Any:
         return {cls.bare: value} if isinstance(value, int | float) and not isinstance(value, bool) else value
 
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if (self.level is None) == (self.slim is None):
+            raise ValueError("expected either a level or a slim" + ("" if self.level is None else "; got both"))
+        if self.slim is not None and self.axis != "raw":
+            raise ValueError("axis: a SLIM surface has no level; leave it out")
+        return self
+
+    @field_validator("slim")
+    @classmethod
+    def _found(cls, slim: str | None, info: ValidationInfo) -> str | None:
+        """Looked for when the scene is read, as a volume is. Raises ValueError unless it holds a SLIM surface."""
+        if slim is None:
+            return None
+        path = find_volume(slim, folder_of(info))
+        if not is_slim(path):
+            raise ValueError(f"expected a file that `filterlab slim` wrote (.npz); got {path}")
+        return str(path)
+
     def at(self, value_range: Callable[[], tuple[float, float]]) -> float:
         """The level as a value of the field. `value_range` is asked where the axis is normalized."""
+        assert self.level is not None
         if self.axis == "raw":
             return self.level
         low, high = value_range()

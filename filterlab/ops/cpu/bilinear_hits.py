@@ -1,0 +1,121 @@
+"""The program that casts rays at bilinear quadrilaterals, eight at a time: what `ops.reference.bilinear` says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from filterlab.ops.bilinear import ACROSS, CENTER, CORNER, LENGTH, PLACE, SQUARE, TWIST, UP
+from filterlab.ops.cpu import frame
+from filterlab.ops.cpu.lanes import DOUBLE, I64, Value
+from filterlab.ops.cpu.tree_walk import Ray, Rows
+from filterlab.ops.quadrics import Kept
+from filterlab.ops.tree import WIDTH
+
+_ROWS = PLACE + 1
+
+
+@dataclass(frozen=True)
+class BilinearVariant:
+    """Everything the program depends on, apart from the machine; attributes as of `ops.cpu.tree_walk.WalkVariant`."""
+
+    kept: Kept
+    reversed: bool
+    fused: bool
+
+    def generate(self) -> str:
+        """The program as LLVM IR text."""
+        module, function = frame.new_module()
+        _Program(self, function).write()
+        return str(module)
+
+
+class _Patch(NamedTuple):
+    """Eight patches and a ray: Q, a, d, h, D; L; what places are off by."""
+
+    from_corner: list[Value]
+    across: list[Value]
+    up: list[Value]
+    twist: list[Value]
+    along: list[Value]
+    length: Value
+    place: Value
+
+
+class _Program(Rows):
+    def leaf(self, ray: Ray, leaf: Value) -> None:
+        e, b = self.lanes, self.builder
+        base = e.advance(self.job.leaves, b.mul(leaf, I64(WIDTH * _ROWS)), DOUBLE)
+        q, behind = self.from_center(ray, self._vector(base, CENTER))
+        near, far = e.subtract(ray.first, behind), e.subtract(ray.last, behind)
+        valid = b.fcmp_ordered("<=", self.dot(q, q), self.rows(base, [SQUARE])[0])
+        with b.if_then(e.any(valid)):
+            patch, turned = self._less_parallel(base, ray, q)
+            front, back, one, off, met = self._roots(patch)
+            for root, counted in zip((front, back), self.counted(one, turned), strict=True):
+                rho, within = self._along(patch, root, off)
+                within = b.and_(within, b.and_(b.fcmp_ordered(">=", rho, near), b.fcmp_ordered("<=", rho, far)))
+                self.take(leaf, e.add(rho, behind), b.and_(b.and_(within, counted), b.and_(valid, met)))
+
+    def _vector(self, base: Value, rows: slice) -> list[Value]:
+        return self.rows(base, range(rows.start, rows.stop))
+
+    def _less_parallel(self, base: Value, ray: Ray, q: list[Value]) -> tuple[_Patch, Value]:
+        """Patches with a and d in the order in which D is less parallel to d + h / 2; and where they changed places."""
+        e, b = self.lanes, self.builder
+        across, up, twist = (self._vector(base, rows) for rows in (ACROSS, UP, TWIST))
+        half = e.constant(0.5)
+        lines = ([e.multiply_add(half, t, x) for t, x in zip(twist, line, strict=True)] for line in (across, up))
+        apart = [self._square(self._cross(ray.along, line)) for line in lines]
+        turned = b.fcmp_ordered(">", apart[0], apart[1])
+        first, second = ([e.where(turned, x, y) for x, y in zip(*p, strict=True)] for p in ((up, across), (across, up)))
+        corner = self._vector(base, CORNER)
+        from_corner = [e.subtract(x, c) for x, c in zip(q, corner, strict=True)]
+        length, place = self.rows(base, [LENGTH, PLACE])
+        return _Patch(from_corner, first, second, twist, ray.along, length, place), turned
+
+    def _roots(self, patch: _Patch) -> tuple[Value, Value, Value, Value, Value]:
+        """u of front and back; masks of those that are one, and by what they are off; a mask of rays that meet any."""
+        e, b = self.lanes, self.builder
+        moment, side = self._cross(patch.from_corner, patch.along), self._cross(patch.across, patch.along)
+        gamma, alpha = self.dot(moment, patch.up), e.negate(self.dot(side, patch.twist))
+        beta = e.multiply(e.constant(0.5), e.subtract(self.dot(moment, patch.twist), self.dot(side, patch.up)))
+        rounding = e.multiply(patch.length, patch.place)
+        radicand = self.difference(beta, alpha, gamma)
+        a, h, g = (e.absolute(x) for x in (alpha, beta, gamma))
+        slack = e.multiply(rounding, e.multiply_add(e.constant(2), h, e.add(a, g)))
+        s, touches = e.square_root(radicand), b.fcmp_ordered("<=", e.absolute(radicand), slack)
+        front, back = self.stable_roots(alpha, beta, gamma, s)
+        front = e.where(touches, e.divide(e.negate(beta), alpha), front)
+        by_root = e.divide(rounding, e.multiply(e.constant(2), s))
+        off = e.where(touches, e.divide(e.square_root(slack), a), by_root)
+        return front, back, touches, off, b.fcmp_ordered(">", e.maximum(e.maximum(a, h), g), rounding)
+
+    def _along(self, patch: _Patch, u: Value, off: Value) -> tuple[Value, Value]:
+        """ρ where rays meet the lines at u, and a mask: where u and v are in [0, 1]."""
+        e, b = self.lanes, self.builder
+        within = self._in_unit(u, off)
+        u = e.clamp(u, e.constant(0), e.constant(1))
+        line = [e.multiply_add(u, t, x) for t, x in zip(patch.twist, patch.up, strict=True)]
+        way = [e.subtract(e.multiply(u, x), c) for x, c in zip(patch.across, patch.from_corner, strict=True)]
+        n = self._cross(patch.along, line)
+        square = self._square(n)
+        v = e.divide(self.dot(self._cross(way, patch.along), n), square)
+        off = e.multiply_add(e.multiply(e.constant(3), patch.length), off, patch.place)
+        off = e.divide(off, e.square_root(square))
+        rho = e.divide(self.dot(self._cross(way, line), n), square)
+        return rho, b.and_(within, self._in_unit(v, off))
+
+    def _in_unit(self, x: Value, off: Value) -> Value:
+        e, b = self.lanes, self.builder
+        low, high = e.negate(off), e.add(e.constant(1), off)
+        return b.and_(b.fcmp_ordered(">=", x, low), b.fcmp_ordered("<=", x, high))
+
+    def _square(self, x: Sequence[Value]) -> Value:
+        return self.dot(x, x)
+
+    def _cross(self, x: Sequence[Value], y: Sequence[Value]) -> list[Value]:
+        e = self.lanes
+        pairs = ((1, 2), (2, 0), (0, 1))
+        return [e.multiply_add(x[i], y[j], e.negate(e.multiply(x[j], y[i]))) for i, j in pairs]

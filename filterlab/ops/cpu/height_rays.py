@@ -1,0 +1,510 @@
+"""The program that casts rays at a spline of heights: every ray walks alone, P of them are searched together.
+
+For P rays in turn, as `ops.height_hits` says:
+
+    walk        from block to block, up and down the pyramid, in integers: no rounding can lose a ray or stop it
+    restrict    in a cell the quartics of both triangles at once: lanes are (upper p, upper q, lower p, lower q), where
+                a step of de Casteljau's algorithm to p is one to q, or to the other of both, in every lane
+    signs       no change of sign: on. One: there is the hit, the ray waits for the others
+                several: the part that holds the first root is looked for at once (`ops.cpu.polynomials`)
+
+and then one root search for all.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+from llvmlite import ir
+
+from filterlab import bernstein
+from filterlab.ops.cpu import frame, job
+from filterlab.ops.cpu.height_cells import GRID, LOWER, UPPER, Windows
+from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, FLOAT, I1, I8, I64, STORAGE, Lanes, Value
+from filterlab.ops.cpu.polynomials import FirstRoot, Rows
+from filterlab.ops.height_hits import DEGREE, POINTS, Cell
+from filterlab.ops.pieces import NO_MOTION
+from filterlab.ops.raycast import REPEATED
+
+LANES = 4
+PACKS_OF_A_CHUNK = 16
+_N = DEGREE + 1
+_NOTHING, _INNER, _AT_START, _AT_END = range(4)
+
+# Arrays are contiguous; R rays, d a double.
+FIELDS: dict[str, type] = {
+    "next": ctypes.c_int64,  # the chunk to be taken next; threads add 1 atomically
+    **GRID,
+    "cells_x": ctypes.c_int64,
+    "cells_y": ctypes.c_int64,
+    "bounds": ctypes.c_void_p,  # `ops.height_hits.Pyramid.numbers`
+    "starts": ctypes.c_void_p,  # int64 of every level
+    "widths": ctypes.c_void_p,  # int64 of every level, blocks of a row
+    "top": ctypes.c_int64,
+    **dict.fromkeys(("shift_x", "shift_y", "spacing_x", "spacing_y"), ctypes.c_double),  # of cells in the world
+    **dict.fromkeys(("end_x", "end_y", "low_z", "high_z"), ctypes.c_double),  # of the box around all; from 0, 0
+    "origins": ctypes.c_void_p,  # (R, 3) numbers, in the world
+    "directions": ctypes.c_void_p,  # (R, 3) numbers
+    "rays": ctypes.c_int64,
+    "t": ctypes.c_void_p,  # (R) d, written, in whole packs: of the first hit
+    "capacity": ctypes.c_int64,  # K, candidates of a ray that there is room for
+    "count": ctypes.c_void_p,  # (R) int64, written: candidates of a ray, also those that there is no room for
+    "places": ctypes.c_void_p,  # (R, K, 3) d, written: start, near, far
+    "pieces": ctypes.c_void_p,  # (R, K, 5) d, written
+    "flags": ctypes.c_void_p,  # (R, K) bytes of `REPEATED`, written
+    "chunks": ctypes.c_int64,  # `next` stops here
+}
+
+
+class HeightRaysJob(job.Job):
+    _fields_ = tuple(FIELDS.items())
+
+
+@dataclass(frozen=True)
+class HeightRaysVariant:
+    """Everything the program depends on, apart from the machine.
+
+    Attributes:
+        asked: "first", "met" or "candidates".
+        cell: what the coefficients of a cell are made of.
+        storage: dtype of the heights.
+        rays: "float32" or "float64".
+    """
+
+    asked: str
+    cell: Cell
+    storage: str
+    rays: str
+
+    def generate(self) -> str:
+        """The program as LLVM IR text."""
+        module, function = frame.new_module()
+        (_Candidates if self.asked == "candidates" else _First)(self, function).write()
+        return str(module)
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A ray from where it enters the box around all heights, in coordinates of cells.
+
+    Attributes:
+        number: of the ray.
+        origin, direction: doubles along x, y, z.
+        start: how far the origin is from that of the ray. far: where it leaves. length: of the direction, in units of
+            the ray's own. Doubles.
+        forward: integers, 1 where x and y grow.
+        meets: whether it meets the box.
+    """
+
+    number: Value
+    origin: list[Value]
+    direction: list[Value]
+    start: Value
+    far: Value
+    length: Value
+    forward: list[Value]
+    meets: Value
+
+    def at(self, e: Lanes, axis: int, s: Value) -> Value:
+        return e.multiply_add(s, self.direction[axis], self.origin[axis])
+
+
+class _Program:
+    """What all have in common: the way, and both pieces in a cell."""
+
+    def __init__(self, variant: HeightRaysVariant, function: ir.Function) -> None:
+        self.variant, self.cell = variant, variant.cell
+        self.builder = ir.IRBuilder(function.append_basic_block("entry"))
+        self.lanes = e = Lanes(self.builder, "float64", LANES)
+        self.job: SimpleNamespace = frame.load_job(e, function.args[0], FIELDS)
+        self.windows = Windows(e, self.job, self.cell, STORAGE[variant.storage])
+        self.points = e.reserve(DOUBLE, POINTS)
+        self.pieces, self.ends = e.reserve(DOUBLE, 2 * _N), e.reserve(DOUBLE, 3)
+        self.passed = e.reserve(I1, 2)
+        self.cell_at = [e.variable(I64(0)) for _ in range(2)]
+        self.level, self.going = e.variable(I64(0)), e.variable(I1(0))
+        self.s, self.ended_at, self.ended_with = (e.variable(DOUBLE(0.0)) for _ in range(3))
+        self.relevant, self.on = e.variable(I1(0)), e.variable(I1(0))
+
+    def write(self) -> None:
+        e, b, j = self.lanes, self.builder, self.job
+        self.prepare()
+        with frame.every_chunk(e, j) as chunk:
+            begin = b.mul(chunk, I64(LANES * PACKS_OF_A_CHUNK))
+            end = e.smaller(b.add(begin, I64(LANES * PACKS_OF_A_CHUNK)), j.rays)
+            with e.repeat(begin, end, LANES) as first:
+                self.begin()
+                with e.repeat(first, e.smaller(b.add(first, I64(LANES)), end)) as number:
+                    self._walk(self._line(number), b.sub(number, first))
+                self.finish(first)
+        b.ret_void()
+
+    def prepare(self) -> None:
+        """Make what is needed of variables."""
+
+    def begin(self) -> None:
+        """Before a pack of lines."""
+
+    def take(self, line: _Line, lane: Value, rows: Rows, near: Value, far: Value, repeated: Value) -> None:
+        """A piece whose coefficients straddle 0; set `going` to 0 where the line need not go on."""
+        raise NotImplementedError
+
+    def finish(self, first: Value) -> None:
+        """A pack of lines from that number on has ended."""
+
+    # --- the way ---
+
+    def _number(self, array: Value, index: Value) -> Value:
+        return self.builder.load(self.lanes.advance(array, index, DOUBLE), typ=DOUBLE)
+
+    def _line(self, number: Value) -> _Line:
+        """As `ops.reference.height_hits.entered` says."""
+        e, b, j = self.lanes, self.builder, self.job
+        zero, one = DOUBLE(0.0), DOUBLE(1.0)
+        origin, direction = (self._world(array, number) for array in (j.origins, j.directions))
+        for axis, (shift, spacing) in enumerate(((j.shift_x, j.spacing_x), (j.shift_y, j.spacing_y))):
+            origin[axis] = e.divide(e.subtract(origin[axis], shift), spacing)
+            direction[axis] = e.divide(direction[axis], spacing)
+        sizes = [self._size(d) for d in direction]
+        length = e.divide(one, e.maximum(e.maximum(sizes[0], sizes[1]), sizes[2]))
+        direction = [e.multiply(d, length) for d in direction]
+        box = list(zip((zero, zero, j.low_z), (j.end_x, j.end_y, j.high_z), strict=True))
+        start, last, moving = zero, DOUBLE(math.inf), []
+        for o, d, (low, high) in zip(origin, direction, box, strict=True):
+            still = b.fcmp_ordered("<=", self._size(d), DOUBLE(NO_MOTION))
+            first, second = (e.divide(e.subtract(end, o), b.select(still, one, d)) for end in (low, high))
+            within = b.and_(b.fcmp_ordered(">=", o, low), b.fcmp_ordered("<=", o, high))
+            near, far = DOUBLE(-math.inf), DOUBLE(math.inf)
+            near, far = b.select(within, near, far), b.select(within, far, near)
+            start = e.maximum(b.select(still, near, e.minimum(first, second)), start)
+            last = e.minimum(b.select(still, far, e.maximum(first, second)), last)
+            moving.append(b.select(still, zero, d))
+        entry = [
+            e.minimum(e.maximum(e.multiply_add(start, d, o), low), high)
+            for o, d, (low, high) in zip(origin, moving, box, strict=True)
+        ]
+        forward = [b.zext(b.fcmp_ordered(">", d, zero), I64) for d in moving[:2]]
+        meets = b.fcmp_ordered("<=", start, last)
+        return _Line(number, entry, moving, start, e.subtract(last, start), length, forward, meets)
+
+    def _world(self, array: Value, number: Value) -> list[Value]:
+        """x, y, z as doubles."""
+        b, kind, found = self.builder, ARITHMETIC[self.variant.rays], []
+        for axis in range(3):
+            place = self.lanes.advance(array, b.add(b.mul(number, I64(3)), I64(axis)), kind)
+            one = b.load(place, typ=kind)
+            found.append(one if kind == DOUBLE else b.fpext(one, DOUBLE))
+        return found
+
+    def _size(self, a: Value) -> Value:
+        """|a| of one double."""
+        return self.lanes.maximum(a, self.builder.fneg(a))
+
+    def _walk(self, line: _Line, lane: Value) -> None:
+        e, b, j = self.lanes, self.builder, self.job
+        for own, place, count in zip(self.cell_at, line.origin[:2], (j.cells_x, j.cells_y), strict=True):
+            own.value = self._cell_of(place, I64(0), b.sub(count, I64(1)))
+        self.level.value, self.going.value = j.top, line.meets
+        self.s.value, self.ended_at.value, self.ended_with.value = DOUBLE(0.0), DOUBLE(-1.0), DOUBLE(0.0)
+        with e.repeat_while(lambda: self.going.value):
+            self._step(line, lane)
+
+    def _cell_of(self, place: Value, low: Value, high: Value) -> Value:
+        """⌊place⌋ within [low, high]."""
+        b = self.builder
+        whole = b.fptosi(place, I64)
+        whole = b.sub(whole, b.zext(b.fcmp_ordered("<", place, b.sitofp(whole, DOUBLE)), I64))
+        return self.lanes.smaller(self._larger(whole, low), high)
+
+    def _larger(self, a: Value, c: Value) -> Value:
+        return self.builder.select(self.builder.icmp_signed(">", a, c), a, c)
+
+    def _step(self, line: _Line, lane: Value) -> None:
+        e, b = self.lanes, self.builder
+        level, s = self.level.value, self.s.value
+        cell = [own.value for own in self.cell_at]
+        ways = [self._way(line, axis, cell[axis], level) for axis in range(2)]
+        out = e.maximum(e.minimum(e.minimum(*ways), line.far), s)
+        self.relevant.value, self.on.value = I1(1), I1(1)
+        with b.if_then(b.icmp_signed(">=", level, I64(self.cell.finest))):
+            self.relevant.value = self._meets(line, cell, level, s, out)
+        with b.if_then(self.relevant.value), b.if_else(b.icmp_signed(">", level, I64(0))) as (down, here):
+            with down:
+                self.level.value, self.on.value = b.sub(level, I64(1)), I1(0)
+            with here:
+                self._in_cell(line, lane, cell, s, out)
+        with b.if_then(b.and_(self.on.value, self.going.value)):
+            self._advance(line, cell, level, ways, out)
+
+    def _way(self, line: _Line, axis: int, cell: Value, level: Value) -> Value:
+        """s where the line leaves its block along an axis."""
+        e, b = self.lanes, self.builder
+        plane = b.shl(b.add(b.ashr(cell, level), line.forward[axis]), level)
+        direction = line.direction[axis]
+        way = e.divide(e.subtract(b.sitofp(plane, DOUBLE), line.origin[axis]), direction)
+        return b.select(b.fcmp_ordered("==", direction, DOUBLE(0.0)), DOUBLE(math.inf), way)
+
+    def _meets(self, line: _Line, cell: Sequence[Value], level: Value, s: Value, out: Value) -> Value:
+        """Whether the line may meet something in its block."""
+        e, b, j = self.lanes, self.builder, self.job
+        own = b.sub(level, I64(self.cell.finest))
+        start, width = (b.load(e.advance(array, own, I64), typ=I64) for array in (j.starts, j.widths))
+        x, y = (b.ashr(n, level) for n in cell)
+        block = e.advance(j.bounds, b.shl(b.add(start, b.add(b.mul(y, width), x)), I64(1)), FLOAT)
+        low, high = (b.fpext(b.load(e.advance(block, I64(k), FLOAT), typ=FLOAT), DOUBLE) for k in range(2))
+        first, last = (line.at(e, 2, at) for at in (s, out))
+        below = b.fcmp_ordered("<=", e.minimum(first, last), high)
+        return b.and_(below, b.fcmp_ordered(">=", e.maximum(first, last), low))
+
+    def _advance(self, line: _Line, cell: Sequence[Value], level: Value, ways: Sequence[Value], out: Value) -> None:
+        """To the beginning of the next block."""
+        e, b, j = self.lanes, self.builder, self.job
+        along_y = b.fcmp_ordered("<", ways[1], ways[0])
+        self.s.value = out
+        leaves = inside = None
+        for axis, count in enumerate((j.cells_x, j.cells_y)):
+            own, forward = cell[axis], b.icmp_signed("!=", line.forward[axis], I64(0))
+            backward = b.fcmp_ordered("<", line.direction[axis], DOUBLE(0.0))
+            low = b.shl(b.ashr(own, level), level)
+            next_ = b.add(low, b.shl(I64(1), level))
+            high = e.smaller(b.sub(next_, I64(1)), b.sub(count, I64(1)))
+            least, most = b.select(forward, own, low), b.select(backward, own, high)
+            place = self._cell_of(line.at(e, axis, out), least, most)
+            across = b.select(forward, next_, b.sub(low, I64(1)))
+            new = b.select(along_y if axis else b.not_(along_y), across, place)
+            self.cell_at[axis].value = new
+            up = b.add(level, I64(1))
+            left = b.icmp_signed("!=", b.ashr(new, up), b.ashr(own, up))
+            fits = b.and_(b.icmp_signed(">=", new, I64(0)), b.icmp_signed("<", new, count))
+            leaves = left if leaves is None else b.or_(leaves, left)
+            inside = fits if inside is None else b.and_(inside, fits)
+        higher = e.smaller(b.add(level, I64(1)), j.top)
+        self.level.value = b.select(leaves, higher, level)
+        self.going.value = b.and_(inside, b.fcmp_ordered("<", out, line.far))
+
+    # --- cells ---
+
+    def _in_cell(self, line: _Line, lane: Value, cell: Sequence[Value], near: Value, far: Value) -> None:
+        e, b = self.lanes, self.builder
+        crossing, upper_first = self._diagonal(line, cell)
+        between = e.minimum(e.maximum(crossing, near), far)
+        self.windows.go_to(*cell)
+        for number, value in enumerate(self.windows.coefficients()):
+            b.store(value, e.advance(self.points, I64(number), DOUBLE))
+        for number, s in enumerate((near, between, far)):
+            b.store(s, e.advance(self.ends, I64(number), DOUBLE))
+        for number, passed in enumerate((b.fcmp_ordered(">=", crossing, near), b.fcmp_ordered("<=", crossing, far))):
+            b.store(passed, e.advance(self.passed, I64(number), I1))
+        self._restrict(line, cell, [near, between, far], upper_first)
+        with e.repeat(I64(0), I64(2)) as k:
+            passed = b.load(e.advance(self.passed, k, I1), typ=I1)
+            with b.if_then(b.and_(passed, self.going.value)):
+                self._piece(line, lane, k)
+
+    def _diagonal(self, line: _Line, cell: Sequence[Value]) -> tuple[Value, Value]:
+        """s where the line crosses the diagonal of its cell, ±∞ beside it, and whether it comes from the upper side."""
+        e, b, (x, y) = self.lanes, self.builder, cell
+        zero, mirrored = DOUBLE(0.0), self.cell.mirrored
+        o, d = (
+            e.subtract(rows[1], rows[0]) if mirrored else e.add(rows[0], rows[1])
+            for rows in (line.origin, line.direction)
+        )
+        level = b.sitofp(b.sub(y, x) if mirrored else b.add(b.add(x, y), I64(1)), DOUBLE)
+        beside = b.select(b.fcmp_ordered("<=", o, level), DOUBLE(math.inf), DOUBLE(-math.inf))
+        crossing = e.divide(e.subtract(level, o), d)
+        return b.select(b.fcmp_ordered("==", d, zero), beside, crossing), b.fcmp_ordered(">=", d, zero)
+
+    def _restrict(self, line: _Line, cell: Sequence[Value], ends: Sequence[Value], upper_first: Value) -> None:
+        """Coefficients of both pieces, in order, into `pieces`."""
+        e, b = self.lanes, self.builder
+        places = [self._place(line, cell, s) for s in ends]
+        heights = [line.at(e, 2, s) for s in ends]
+        first, second = ([(*places[k], heights[k]) for k in own] for own in ((0, 1), (1, 2)))
+        choose = lambda a, c: [b.select(upper_first, x, y) for x, y in zip(a, c, strict=True)]  # noqa: E731
+        upper = [choose(*pair) for pair in zip(first, second, strict=True)]
+        lower = [choose(*pair) for pair in zip(second, first, strict=True)]
+        one = DOUBLE(1.0)
+        turned = [[e.subtract(one, s), e.subtract(one, t), z] for s, t, z in lower]
+        s, t, z = (self._pack(column) for column in zip(*upper, *turned, strict=True))
+        weights = [e.subtract(e.subtract(e.constant(1), s), t), s, t]
+        rows = self._blossoms(weights)
+        other = self._swapped(z)
+        for number, row in enumerate(rows):  # lanes 0 and 2 are number, 1 and 3 are n − number
+            line_ = e.multiply_add(e.subtract(other, z), e.constant(number / DEGREE), z)
+            c = e.subtract(row, line_)
+            for lane in range(4):
+                place = number if lane % 2 == 0 else DEGREE - number
+                if 2 * number == DEGREE and lane % 2:
+                    continue
+                is_first = upper_first if lane < 2 else b.not_(upper_first)
+                index = b.add(b.select(is_first, I64(0), I64(_N)), I64(place))
+                b.store(e.lane(c, lane), e.advance(self.pieces, index, DOUBLE))
+
+    def _place(self, line: _Line, cell: Sequence[Value], s: Value) -> list[Value]:
+        """s and t in the cell, from the side where the upper triangle has its right angle."""
+        e, b, out = self.lanes, self.builder, []
+        for axis in range(2):
+            own = e.subtract(line.origin[axis], b.sitofp(cell[axis], DOUBLE))
+            place = e.multiply_add(s, line.direction[axis], own)
+            out.append(e.minimum(e.maximum(place, DOUBLE(0.0)), DOUBLE(1.0)))
+        return [e.subtract(DOUBLE(1.0), out[0]), out[1]] if self.cell.mirrored else out
+
+    def _pack(self, numbers: Sequence[Value]) -> Value:
+        pack = self.lanes.constant(0)
+        for lane, number in enumerate(numbers):
+            pack = self.builder.insert_element(pack, number, I64(lane))
+        return pack
+
+    def _swapped(self, pack: Value) -> Value:
+        """p and q, each in the other's place."""
+        return self.lanes.shuffle(pack, pack, [1, 0, 3, 2])
+
+    def _blossoms(self, own: Sequence[Value]) -> list[Value]:
+        """c_0, c_1, c_2 in the lanes of p, c_4, c_3, c_2 in those of q, from weights of p and q."""
+        other = [self._swapped(w) for w in own]
+        thrice = self._to(self._to(self._corners(), own, 3), own, 2)
+        twice_and_other = self._to(thrice, other, 1)
+        thrice = self._to(thrice, own, 1)
+        return [*self._to(thrice, own, 0), *self._to(thrice, other, 0), *self._to(twice_and_other, other, 0)]
+
+    def _corners(self) -> list[Value]:
+        """The coefficients of the upper triangle in two lanes, of the lower one in two."""
+        e, found = self.lanes, []
+        for upper, lower in zip(UPPER, LOWER, strict=True):
+            up, low = (e.everywhere(self._number(self.points, I64(n))) for n in (upper, lower))
+            found.append(e.shuffle(up, low, [0, 1, 6, 7]))
+        return found
+
+    def _to(self, rows: Sequence[Value], weights: Sequence[Value], degree: int) -> list[Value]:
+        """A step of de Casteljau's algorithm, to so low a degree."""
+        e = self.lanes
+        place = {alpha: n for n, alpha in enumerate(bernstein.multi_indices(degree + 1, 2))}
+        found = []
+        for i, j, k in bernstein.multi_indices(degree, 2):
+            corners = ((i + 1, j, k), (i, j + 1, k), (i, j, k + 1))
+            total = None
+            for corner, weight in zip(corners, weights, strict=True):
+                total = e.multiply_add(rows[place[corner]], weight, total)
+            found.append(total)
+        return found
+
+    def _piece(self, line: _Line, lane: Value, k: Value) -> None:
+        """Number k of a cell."""
+        e, b, zero = self.lanes, self.builder, DOUBLE(0.0)
+        base = e.advance(self.pieces, b.mul(k, I64(_N)), DOUBLE)
+        rows = [self._number(base, I64(n)) for n in range(_N)]
+        near, far = (self._number(self.ends, b.add(k, I64(n))) for n in range(2))
+        before = self.ended_with.value
+        finite = lambda x: b.fcmp_ordered("==", e.subtract(x, x), zero)  # noqa: E731
+        joined = b.and_(b.fcmp_ordered("==", near, self.ended_at.value), finite(before))
+        joined = b.and_(joined, finite(rows[0]))
+        rows[0] = b.select(joined, before, rows[0])
+        self.ended_at.value, self.ended_with.value = far, rows[-1]
+        low = high = total = rows[0]
+        for row in rows[1:]:
+            low, high, total = e.minimum(low, row), e.maximum(high, row), e.add(total, row)
+        straddles = b.and_(b.fcmp_ordered("<=", low, zero), b.fcmp_ordered(">=", high, zero))
+        with b.if_then(b.and_(straddles, finite(total)), likely=False):
+            self.take(line, lane, rows, near, far, b.and_(joined, b.fcmp_ordered("==", before, zero)))
+
+
+class _First(_Program):
+    """Every line waits at its first hit, and all of a pack are searched together."""
+
+    def prepare(self) -> None:
+        e = self.lanes
+        self.search = FirstRoot(e, DEGREE)
+        self.rows = e.reserve(DOUBLE, _N * LANES)
+        self.a, self.h, self.near, self.far, self.start, self.length = (e.reserve(DOUBLE, LANES) for _ in range(6))
+        self.kind = e.reserve(I64, LANES)
+
+    def begin(self) -> None:
+        e, one, zero = self.lanes, self.lanes.constant(1), self.lanes.constant(0)
+        for n in range(_N):
+            e.store(one, e.advance(self.rows, I64(n * LANES), DOUBLE))
+        for place in (self.a, self.near, self.far, self.start, self.length):
+            e.store(zero, place)
+        e.store(one, self.h)
+        e.store(e.integers(_NOTHING), self.kind)
+
+    def take(self, line: _Line, lane: Value, rows: Rows, near: Value, far: Value, repeated: Value) -> None:
+        e, b, search, zero = self.lanes, self.builder, self.search, DOUBLE(0.0)
+        turn = b.select(b.fcmp_ordered("<", rows[0], zero), DOUBLE(-1.0), DOUBLE(1.0))
+        at_start = b.fcmp_ordered("==", rows[0], zero)
+        *own, end = (e.multiply(turn, row) for row in rows)
+        on_end = b.fcmp_ordered("==", end, zero)  # a root for the case that there is no earlier one
+        own.append(b.select(on_end, DOUBLE(2.0**-1022), end))
+        packs = [e.everywhere(row) for row in own]
+        changes = search.changes(search.negative(search.lowered(packs)))
+        once = b.icmp_unsigned("==", e.lane(changes, 0), I8(1))
+        simple = b.and_(b.and_(b.not_(at_start), once), b.fcmp_ordered("<", own[-1], zero))
+        kind = e.variable(I64(_NOTHING))
+        kind.value = b.select(at_start, I64(_AT_START), b.select(simple, I64(_INNER), I64(_NOTHING)))
+        with b.if_then(simple):
+            self._keep(lane, own, zero, DOUBLE(1.0))
+        with b.if_then(b.icmp_signed("==", kind.value, I64(_NOTHING)), likely=False):
+            kind.value = b.select(on_end, I64(_AT_END), I64(_NOTHING))
+
+            def keep(mask: Value, part: Rows, a: Value, h: Value) -> None:
+                self._keep(lane, *([e.lane(p, 0) for p in part], e.lane(a, 0), e.lane(h, 0)))
+                kind.value = I64(_INNER)
+
+            search.first_part(ir.Constant(ir.VectorType(I1, LANES), [True] * LANES), packs, keep)
+        with b.if_then(b.icmp_signed("!=", kind.value, I64(_NOTHING))):
+            self.going.value = I1(0)
+            b.store(kind.value, e.advance(self.kind, lane, I64))
+            ends = (self.near, near), (self.far, far), (self.start, line.start), (self.length, line.length)
+            for array, value in ends:
+                b.store(value, e.advance(array, lane, DOUBLE))
+
+    def _keep(self, lane: Value, rows: Rows, a: Value, h: Value) -> None:
+        e, b = self.lanes, self.builder
+        for n, row in enumerate(rows):
+            b.store(row, e.advance(self.rows, b.add(lane, I64(n * LANES)), DOUBLE))
+        for array, value in ((self.a, a), (self.h, h)):
+            b.store(value, e.advance(array, lane, DOUBLE))
+
+    def finish(self, first: Value) -> None:
+        e, b = self.lanes, self.builder
+        kind = e.load(self.kind, I64, LANES)
+        a, h, near, far = (e.load(x, DOUBLE, LANES) for x in (self.a, self.h, self.near, self.far))
+        start, length = (e.load(x, DOUBLE, LANES) for x in (self.start, self.length))
+        is_ = lambda k: b.icmp_signed("==", kind, e.integers(k))  # noqa: E731
+        within = e.variable(e.constant(0))
+        if self.variant.asked == "first":
+            with b.if_then(e.any(is_(_INNER))):
+                rows = [e.load(e.advance(self.rows, I64(n * LANES), DOUBLE), DOUBLE, LANES) for n in range(_N)]
+                within.value = e.multiply_add(self.search.root(rows, is_(_INNER)), h, a)
+        own = e.where(is_(_AT_START), e.constant(0), e.where(is_(_AT_END), e.constant(1), within.value))
+        s = e.minimum(e.maximum(e.multiply_add(e.subtract(far, near), own, near), near), far)
+        found = e.where(is_(_NOTHING), e.constant(math.inf), e.multiply(length, e.add(start, s)))
+        e.store(found, e.advance(self.job.t, first, DOUBLE))
+
+
+class _Candidates(_Program):
+    """Every piece that may hold a hit is written down, as far as there is room; all are counted."""
+
+    def prepare(self) -> None:
+        self.count = self.lanes.variable(I64(0))
+
+    def _walk(self, line: _Line, lane: Value) -> None:
+        self.count.value = I64(0)
+        super()._walk(line, lane)
+        self.builder.store(self.count.value, self.lanes.advance(self.job.count, line.number, I64))
+
+    def take(self, line: _Line, lane: Value, rows: Rows, near: Value, far: Value, repeated: Value) -> None:
+        e, b, j = self.lanes, self.builder, self.job
+        count = self.count.value
+        with b.if_then(b.icmp_signed("<", count, j.capacity)):
+            index = b.add(b.mul(line.number, j.capacity), count)
+            flag = b.select(repeated, I8(REPEATED), I8(0))
+            places = [e.multiply(line.length, x) for x in (line.start, near, far)]
+            arrays = (j.places, places, DOUBLE), (j.pieces, rows, DOUBLE), (j.flags, [flag], I8)
+            for array, numbers, kind in arrays:
+                for n, number in enumerate(numbers):
+                    b.store(number, e.advance(array, b.add(b.mul(index, I64(len(numbers))), I64(n)), kind))
+        self.count.value = b.add(count, I64(1))

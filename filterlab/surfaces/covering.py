@@ -1,0 +1,242 @@
+"""Covers of scanned points by balls, as large as the tolerance lets them be.
+
+From large to small, level by level: of the points that are not covered yet some are drawn that are well apart, balls of
+the level's radius around them are fitted all at once, and those that meet the tolerance are kept; around the others
+smaller ones are tried on later levels. A ball is never smaller than to the `least`-th neighbour of its centre: there it
+is kept whatever its misfit. A point is covered when the weights of the balls that it is in sum up to ½.
+
+A ball meets the tolerance if the root of the weighted mean of squared distances of its points is within it, and none
+is further off than four times that. Points whose normals look the other way, as those of a wall behind, are not its
+own. If one graph does not meet it, two are tried that share a sharp edge (`surfaces.edges`).
+
+Source: Ohtake, Belyaev & Alexa, Sparse low-degree implicit surfaces with applications to high quality rendering,
+feature extraction, and smoothing, 2005, whose balls minimise an error instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from filterlab.ops.reference.slim import weight
+from filterlab.surfaces.edges import by_normals, edges_in, ends_in, highest, none
+from filterlab.surfaces.graphs import Graphs, Pairs, fitted, summed, unit
+from filterlab.surfaces.scans import Progress, Scan, tree_of
+
+ENOUGH = 0.5
+"""Sum of weights from which on a point is covered."""
+LARGEST = 0.25
+"""Radius of the first balls, in diagonals."""
+_STEP = 2**-0.5  # from radius to radius
+_SPREAD = 0.5  # of a radius between centres that are drawn together
+_BESIDE = 0.35  # of a radius around those that failed, where no others are tried
+_DRAWS = 3  # on a level
+_WORST = 4.0  # times the tolerance
+_ROOM = 1.1  # times the distance of the farthest of the fewest points
+_FIRST = 60  # points, about, by which balls are tried at first
+_DOUBTFUL = 1.3  # times the tolerance, by them
+_LOOSE = 48  # points, from which on a ball may not reach across what was not scanned
+_AWAY = -0.5  # n·m of normals on both sides of an edge, at least
+
+
+class Fits(NamedTuple):
+    """Balls that are fitted.
+
+    Attributes:
+        graphs: M. pairs: of points with the graph they belong to. off: (P,) their distances.
+        cuts: (M, K, 4), as in `surfaces.edges`.
+    """
+
+    graphs: Graphs
+    pairs: Pairs
+    off: Tensor
+    cuts: Tensor
+
+
+@dataclass
+class Cover:
+    """What covers a scan so far.
+
+    Attributes:
+        order: of the graphs.
+        least_radius: (N,) of a ball around each point.
+        weight, off: (N,) sums of weights, and of weights times distances.
+        graphs, cuts: of the balls that were kept, part by part.
+        sharp, smallest: numbers of balls that share an edge, and of those kept whatever their misfit.
+    """
+
+    scan: Scan
+    tolerance: float
+    order: int
+    least_radius: Tensor
+    weight: Tensor
+    off: Tensor
+    graphs: list[Graphs] = field(default_factory=list)
+    cuts: list[Tensor] = field(default_factory=list)
+    sharp: int = 0
+    smallest: int = 0
+
+    @classmethod
+    def of(cls, scan: Scan, tolerance: float, least: int, order: int, progress: Progress) -> Cover:
+        """The whole cover."""
+        farthest = scan.levels[0].tree.query(scan.points.numpy(), [least], workers=-1)[0][:, 0]
+        zeros = torch.zeros(len(scan.points), dtype=torch.float64)
+        cover = cls(scan, tolerance, order, _ROOM * torch.from_numpy(farthest), zeros, zeros.clone())
+        cover._grow(progress)
+        return cover
+
+    def _grow(self, progress: Progress) -> None:
+        drawn, radius = np.random.default_rng(self.scan.seed), LARGEST
+        while bool((open_ := self.weight < ENOUGH).any()):
+            for _ in range(_DRAWS):
+                numbers = _apart(self.scan.points, (open_ & (self.weight < ENOUGH)).nonzero()[:, 0], radius, drawn)
+                if not len(numbers):
+                    break
+                failed = self._take(numbers, radius)
+                open_ &= ~_near(self.scan.points, failed, _BESIDE * radius)
+                progress(float((self.weight >= ENOUGH).double().mean()))
+            radius *= _STEP
+
+    def _take(self, numbers: Tensor, radius: float) -> Tensor:
+        """Tries balls around points; those that are kept count. Returns the numbers of the others."""
+        radii = self.least_radius[numbers].clamp_min(radius)
+        last = radii > radius
+        hopeful = last | self._hopeful(numbers, radii)
+        failed = [numbers[~hopeful]]
+        numbers, radii, last = numbers[hopeful], radii[hopeful], last[hopeful]
+        for some, pairs in self.scan.levels[0].parts(self.scan.points[numbers], radii):
+            kept = self._take_part(numbers[some], radii[some], last[some], pairs)
+            failed.append(numbers[some][~kept])
+        return torch.cat(failed)
+
+    def _hopeful(self, numbers: Tensor, radii: Tensor) -> Tensor:
+        """(M,) which balls may meet the tolerance, by some of their points."""
+        scan, hopeful = self.scan, torch.ones(len(numbers), dtype=torch.bool)
+        count = float(np.median(scan.levels[0].counts(scan.points[numbers], radii)))
+        level = min(len(scan.levels) - 1, int(np.log(max(count / _FIRST, 1)) / np.log(4)))
+        if not level:
+            return hopeful
+        for some, pairs in scan.levels[level].parts(scan.points[numbers], radii):
+            tried = _tried(scan, numbers[some], radii[some], pairs, _DOUBTFUL * self.tolerance, self.order)
+            hopeful[some] = tried.good | tried.sharp
+        return hopeful
+
+    def _take_part(self, numbers: Tensor, radii: Tensor, last: Tensor, pairs: Pairs) -> Tensor:
+        """(M,) which of the balls are kept."""
+        tried = _tried(self.scan, numbers, radii, pairs, self.tolerance, self.order)
+        unmet = last & ~tried.good & ~tried.sharp
+        self._keep(tried.single, tried.good | unmet)
+        if tried.double is not None:
+            self._keep(tried.double, tried.halves)
+        self.sharp, self.smallest = self.sharp + 2 * int(tried.sharp.sum()), self.smallest + int(unmet.sum())
+        kept = tried.good | tried.sharp | last
+        self.weight[numbers[kept]] = self.weight[numbers[kept]].clamp_min(ENOUGH)  # whatever its normal
+        return kept
+
+    def _keep(self, fits: Fits, kept: Tensor) -> None:
+        own = kept[fits.pairs.ball]
+        w, point = weight(fits.pairs.square[own]), fits.pairs.point[own]
+        self.weight.index_add_(0, point, w)
+        self.off.index_add_(0, point, w * fits.off[own])
+        self.graphs.append(fits.graphs[kept])
+        self.cuts.append(fits.cuts[kept])
+
+
+class Tried(NamedTuple):
+    """What is known of balls (M,).
+
+    Attributes:
+        single: a graph for each. good: (M,) whether it meets the tolerance.
+        double: two graphs for some of the others; None: there are no others. halves: which of them are good.
+        sharp: (M,) whose two graphs are.
+    """
+
+    single: Fits
+    good: Tensor
+    double: Fits | None
+    halves: Tensor
+    sharp: Tensor
+
+
+def _tried(scan: Scan, numbers: Tensor, radii: Tensor, pairs: Pairs, tolerance: float, order: int) -> Tried:
+    """One graph in each ball around points; two where that does not meet the tolerance."""
+    centers = scan.points[numbers]
+    own, mean = _facing(scan, numbers, pairs, 0.0)
+    graphs = fitted(scan.points, own, centers, radii, mean, order)
+    single, good = _judged(scan, scan.spacing[numbers], graphs, own, tolerance, None)
+    sharp, rest = torch.zeros_like(good), ~good
+    own, _ = _facing(scan, numbers, pairs, _AWAY)
+    own = own.of(rest)
+    side, bent = by_normals(scan.normals, own, int(rest.sum()))
+    if not bool(bent.any()):
+        return Tried(single, good, None, sharp, sharp)
+    side, own = side[bent[own.ball]], own.of(bent)
+    rest = rest.nonzero()[:, 0][bent]
+    edges = edges_in(scan.points, scan.normals, own, side, centers[rest], radii[rest], order)
+    spacing = scan.spacing[numbers[rest]].repeat_interleave(2)
+    double, met = _judged(scan, spacing, edges.graphs, edges.pairs, tolerance, edges.cuts)
+    sharp[rest] = edges.valid & met.reshape(-1, 2).all(1)
+    return Tried(single, good, double, sharp[rest].repeat_interleave(2), sharp)
+
+
+def _judged(
+    scan: Scan, spacing: Tensor, graphs: Graphs, pairs: Pairs, tolerance: float, cuts: Tensor | None
+) -> tuple[Fits, Tensor]:
+    """The fits, with planes at ends, and (M,) whether they meet the tolerance."""
+    off, count = graphs.distances(scan.points[pairs.point], pairs.ball), len(graphs.centers)
+    w = weight(pairs.square)
+    sums = summed(torch.stack((w, w * off * off, torch.ones_like(w)), 1), pairs.ball, count)
+    met = sums[:, 1] <= tolerance**2 * sums[:, 0]
+    met &= highest(off.abs(), pairs.ball, count) <= _WORST * tolerance
+    planes, loose = ends_in(scan.points, scan.ends, spacing, graphs, pairs)
+    met &= (loose == 0) | (sums[:, 2] < _LOOSE)
+    edge = none(planes).expand(count, 1, 4) if cuts is None else cuts
+    return Fits(graphs, pairs, off, torch.cat((planes, edge), 1)), met
+
+
+def _facing(scan: Scan, numbers: Tensor, pairs: Pairs, least: float) -> tuple[Pairs, Tensor]:
+    """Pairs of points whose normals agree with that of the ball's, and these, (M, 3): means, but of their centres'."""
+    own = scan.normals[numbers]
+    pairs = pairs.where((scan.normals[pairs.point] * own[pairs.ball]).sum(-1) > least)
+    mean = unit(summed(weight(pairs.square)[:, None] * scan.normals[pairs.point], pairs.ball, len(numbers)))
+    mean = torch.where((mean * own).sum(-1, keepdim=True) > 0, mean, own)
+    return pairs.where((scan.normals[pairs.point] * mean[pairs.ball]).sum(-1) > least), mean
+
+
+def _apart(points: Tensor, numbers: Tensor, radius: float, drawn: np.random.Generator) -> Tensor:
+    """Some of the points of those numbers, further from each other than a part of the radius."""
+    apart = _SPREAD * radius
+    cell = (points[numbers] / apart).floor().long()
+    cell -= cell.amin(0) if len(cell) else 0
+    order = drawn.permutation(len(numbers))
+    key = (cell * cell.new_tensor([1 << 42, 1 << 21, 1])).sum(-1).numpy()[order]
+    numbers = numbers[torch.from_numpy(order[np.unique(key, return_index=True)[1]])]
+    return numbers[
+        _independent(tree_of(points[numbers]).query_pairs(apart, output_type="ndarray"), len(numbers), drawn)
+    ]
+
+
+def _independent(pairs: np.ndarray, count: int, drawn: np.random.Generator) -> Tensor:
+    """(count,) a largest set of which no two are a pair: by lots, the lowest first."""
+    lot = drawn.permutation(count)
+    left, chosen = np.ones(count, bool), np.zeros(count, bool)
+    while left.any():
+        first = left.copy()
+        first[np.where(lot[pairs[:, 0]] < lot[pairs[:, 1]], pairs[:, 1], pairs[:, 0])] = False
+        chosen |= first
+        left &= ~first
+        left[pairs[first[pairs].any(1)]] = False
+        pairs = pairs[left[pairs].all(1)]
+    return torch.from_numpy(chosen)
+
+
+def _near(points: Tensor, numbers: Tensor, distance: float) -> Tensor:
+    """(N,) which points are so near to some of those numbers."""
+    if not len(numbers):
+        return torch.zeros(len(points), dtype=torch.bool)
+    nearest = tree_of(points[numbers]).query(points.numpy(), distance_upper_bound=distance)[0]
+    return torch.from_numpy(np.isfinite(nearest))

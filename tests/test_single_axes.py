@@ -1,0 +1,129 @@
+"""Volumes of one voxel along an axis: one coefficient there, and the field of the same samples repeated along it."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+import torch
+
+import filterlab as fl
+from filterlab.fields.grid import GridField
+from filterlab.kernels import CENTRAL_DIFFERENCE, KERNELS, Kernel, bc, bspline
+from filterlab.methods import METHODS, TensorProduct, from_kernel
+from filterlab.prefilters import IDENTITY
+from filterlab.render import PerspectiveCamera, TransferFunction, render
+from filterlab.render.shading import Light, Shading
+
+SHAPES = ((1, 6, 7), (6, 1, 7), (6, 7, 1), (1, 1, 7))
+SEPARABLE = [name for name, method in METHODS.items() if isinstance(method, TensorProduct)]
+KEPT = ("mirror", "reflect", "wrap", "border")
+
+
+def built(samples, method, boundary: str, **options) -> GridField:
+    field = fl.reconstruct(samples, method, boundary=boundary, **options)
+    assert isinstance(field, GridField)
+    return field
+
+
+def repeated(samples: torch.Tensor) -> torch.Tensor:
+    """Three voxels along every axis of one: constant there, as the other is said to be."""
+    return samples.repeat(*(3 if n == 1 else 1 for n in samples.shape))
+
+
+@pytest.mark.parametrize(("method", "scheme"), [(m, s) for m in SEPARABLE for s in ("direct", "fused")])
+def test_the_field_is_that_of_samples_repeated_along_the_axis(method, scheme):
+    every = product(SHAPES, KEPT) if scheme == "direct" else zip(SHAPES, KEPT, strict=True)
+    for number, (shape, boundary) in enumerate(every):
+        draw = torch.Generator().manual_seed(number)
+        samples = torch.randn(shape, generator=draw, dtype=torch.float64).requires_grad_()
+        points = ((torch.rand(40, 3, generator=draw, dtype=torch.float64) - 0.3) * 12).requires_grad_()
+        one, three = (built(x, method, boundary, scheme=scheme) for x in (samples, repeated(samples)))
+        order = min(one.max_order, 2)
+        shifted = points + torch.tensor([float(n == 1) for n in reversed(shape)])  # the middle of the three
+        cotangents = None
+        results = []
+        for field, at in ((one, points), (three, shifted)):
+            rows = field.jet(at, order)
+            if cotangents is None:
+                cotangents = [torch.randn(row.shape, generator=draw, dtype=row.dtype) for row in rows]
+            loss = torch.stack([(row * c).sum() for row, c in zip(rows, cotangents, strict=True)]).sum()
+            results.append((*rows, *torch.autograd.grad(loss, (samples, points))))
+        for found, expected in zip(*results, strict=True):
+            torch.testing.assert_close(found, expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("boundary", KEPT)
+def test_one_coefficient_along_an_axis_of_one_voxel(boundary):
+    for method, reach, beyond in (("triquadratic", 2, 17), ("tricubic", 3, 23)):  # with float32's decay
+        pad = 2 * (beyond if boundary == "border" else reach)
+        values = built(torch.rand(1, 512, 512), method, boundary).coefficients.values
+        assert values.shape == (1, 512 + pad, 512 + pad)
+        spare = values.untyped_storage().nbytes() - 4 * (512 + pad) ** 2  # 1.14 or 1.19 volumes; they were 40 and 56
+        assert 0 <= spare < 64
+    assert built(torch.rand(40, 1, 1), "notch", boundary).coefficients.values.shape[-2:] == (1, 1)
+
+
+def test_zeros_go_on_beyond_one_voxel_too():
+    values = built(torch.rand(1, 8, 8), "triquadratic", "zeros").coefficients.values
+    assert values.shape[0] == values.shape[1] - 7
+
+
+def test_kernels_whose_translates_do_not_sum_to_a_constant_keep_their_taps():
+    double_width = Kernel("sawtooth", bspline(1).pieces[:1] * 2)
+    assert double_width.sum_over_translates is None
+    field = built(torch.rand(1, 5, 5), from_kernel(double_width, IDENTITY), "border")
+    assert field.coefficients.values.shape[0] > 1
+
+
+@pytest.mark.parametrize("kernel", [*KERNELS.values(), bc(0.4, 0.2)], ids=lambda k: k.name)
+def test_sum_over_translates(kernel):
+    x = torch.linspace(0, 1, 17, dtype=torch.float64)
+    total = torch.stack([kernel(x - k) for k in range(-4, 5)]).sum(0)
+    assert kernel.sum_over_translates == 1
+    torch.testing.assert_close(total[:-1], torch.ones(16, dtype=torch.float64), rtol=0, atol=1e-14)
+    assert CENTRAL_DIFFERENCE.sum_over_translates == 0
+
+
+@pytest.mark.parametrize("boundary", ["mirror", "border"])
+@pytest.mark.parametrize("storage", ["float16", "uint8"])
+def test_short_storage_of_one_plane(storage, boundary):
+    samples = torch.rand(1, 9, 8, generator=torch.Generator().manual_seed(5))
+    points = torch.rand(60, 3, generator=torch.Generator().manual_seed(6)) * 8
+    short, exact = (built(samples, "triquadratic", boundary, storage=s) for s in (storage, None))
+    assert short.coefficients.values.shape == exact.coefficients.values.shape
+    torch.testing.assert_close(short(points), exact(points), rtol=0, atol=6e-3)
+
+
+@pytest.mark.parametrize("boundary", ["mirror", "border"])
+@pytest.mark.parametrize("method", ["trilinear", "triquadratic", "notch", "tricubic"])
+def test_surfaces_of_one_plane(method, boundary):
+    samples = torch.rand(1, 12, 12, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    one, three = built(samples, method, boundary), built(repeated(samples), method, boundary)
+    origins = torch.tensor([[x, y, -0.3] for x, y in product((-0.4, 2.1, 5.2, 8.7), (1.3, 6.6, 9.9))]).double()
+    directions = torch.tensor([1.0, 0.4, 0.05]).double().expand_as(origins)
+    t = one.first_crossing(origins, directions, 0.5)
+    hit = t.isfinite()
+    assert hit.any()
+    assert not hit.all()
+    at, middle = (origins + directions * t[:, None])[hit], torch.tensor([0.0, 0.0, 1.0]).double()
+    torch.testing.assert_close(three(at + middle), torch.full_like(t[hit], 0.5), rtol=0, atol=1e-9)
+    plain = built(samples, method, boundary, scheme="direct").first_crossing(origins, directions, 0.5)
+    torch.testing.assert_close(plain, t, rtol=0, atol=1e-9)
+    assert one.lattice.continuous
+    assert one.lattice.cells[2] == 1
+
+
+@pytest.mark.parametrize("boundary", ["mirror", "border"])
+@pytest.mark.parametrize("method", ["trilinear", "triquadratic", "tricubic", "ncrsi"])
+def test_images_of_one_plane(method, boundary):
+    samples = torch.rand(1, 16, 16, generator=torch.Generator().manual_seed(4))
+    transfer = TransferFunction([0.2, 0.5, 0.9], [[0, 0, 1.0], [0, 1, 0], [1, 0, 0]], [0.0, 0.4, 0.9])
+    camera = PerspectiveCamera(position=(7.5, 9.0, -30.0), target=(7.5, 7.5, 0.0))
+    shading = Shading(lights=[Light()])
+    fused, plain = (
+        render(built(samples, method, boundary, scheme=s), camera, transfer, size=(24, 20), step=0.05, shading=shading)
+        for s in ("fused", "direct")
+    )
+    assert float(fused.max()) > 0.05
+    torch.testing.assert_close(fused, plain, rtol=0, atol=2e-5)
