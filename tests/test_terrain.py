@@ -192,6 +192,17 @@ def test_a_flight_keeps_its_height_and_looks_ahead():
         Flight(points=[points[0], points[0]])
 
 
+def test_a_flight_goes_over_what_is_in_its_way():
+    """From one side of the ridge to the other, straight through it but for the quarter of 20 m that is kept."""
+    heights = hills()
+    left, bottom, right, top = heights.extent
+    ends = [(left + f * (right - left), bottom + (1 - f) * (top - bottom), 20.0) for f in (0.2, 0.8)]
+    own = terrain(heights)
+    places = torch.tensor([camera.position for camera in Flight(points=ends).cameras(own, 15)], dtype=torch.float64)
+    above = places[:, 2] - own.surface.jet(places[:, :2], 0)[0]
+    assert above.min() == pytest.approx(5.0)
+
+
 def test_a_turn_keeps_its_distance():
     cameras = terrain().around(5)
     lengths = [math.dist([float(v) for v in c.position], [float(v) for v in c.target]) for c in cameras]
