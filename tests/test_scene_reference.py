@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from pydantic import create_model
@@ -32,6 +33,7 @@ def test_every_key_is_described_and_has_an_example(
     for name in ("engine.nrrd", "head.nii.gz", "series.nii.gz"):
         (tmp_path / name).touch()
     save_image(torch.rand(4, 8, 3), tmp_path / "sky.png")
+    np.savez(tmp_path / "bunny.npz", slim=1)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SCANS", str(tmp_path))
     assert set(reference.described(model)) == set(model.model_fields)
@@ -67,7 +69,7 @@ def test_rows_say_what_the_models_say() -> None:
     ):
         assert row in page
     assert re.search(r"\| `step` \|.*\| number > 0; voxels \|  \|", page)
-    assert re.search(r"\| `level` \|.*\| \*required\* \|", page)
+    assert re.search(r"\| `lower` \|.*\| \*required\* \|", page)
     assert re.search(r"\| `name` \|.*`triquadratic`.*`auto` \| `triquadratic` \|", page)
 
 
