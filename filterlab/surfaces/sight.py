@@ -12,16 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from filterlab.arrays import Array, as_tensor
 from filterlab.ops.differentiable import height_hits as ops
-
-if TYPE_CHECKING:
-    from filterlab.surfaces.height_field import HeightField
+from filterlab.ops.height_hits import HeightHits
 
 EARTH_RADIUS = 6_371_008.8
 """Mean radius of the earth, in metres."""
@@ -34,8 +32,25 @@ _RAYS_AT_ONCE = 1 << 20
 _HALVINGS = 60  # of the angle from the nadir to the zenith
 
 
+class Terrain(Protocol):
+    """What is asked of a `HeightField`, which says what each is."""
+
+    heights: Tensor
+
+    @property
+    def places(self) -> Tensor: ...
+    @property
+    def cast(self) -> HeightHits: ...
+    @property
+    def device(self) -> torch.device: ...
+    @property
+    def detached(self) -> Any: ...
+    def with_tensors(self, tensors: Sequence[Tensor]) -> Any: ...
+    def jet(self, points: Array, order: int) -> tuple[Tensor, ...]: ...
+
+
 def viewshed(
-    surface: HeightField,
+    surface: Terrain,
     observer: Array | Sequence[float],
     height: float,
     target: float,
@@ -54,7 +69,7 @@ def viewshed(
     return torch.cat(parts).reshape(places.shape[:-1]) if parts else flat.new_zeros(places.shape[:-1], dtype=torch.bool)
 
 
-def _seen(ground: HeightField, eye: Tensor, places: Tensor, target: float, implementation: str | None) -> Tensor:
+def _seen(ground: Terrain, eye: Tensor, places: Tensor, target: float, implementation: str | None) -> Tensor:
     """(P,) of places (P, 2)."""
     aim = torch.cat((places, (ground.jet(places, 0)[0] + target)[:, None]), 1)
     way = aim - eye
@@ -66,7 +81,7 @@ def _seen(ground: HeightField, eye: Tensor, places: Tensor, target: float, imple
 
 
 def horizon(
-    surface: HeightField,
+    surface: Terrain,
     observer: Array | Sequence[float],
     azimuths: Array | Sequence[float],
     height: float,
@@ -90,7 +105,7 @@ def horizon(
     return ((low + high) / 2).reshape(azimuths.shape)
 
 
-def _observer(surface: HeightField, observer: Array | Sequence[float]) -> Tensor:
+def _observer(surface: Terrain, observer: Array | Sequence[float]) -> Tensor:
     place = torch.as_tensor(observer, dtype=torch.float64)
     if place.shape != (2,):
         raise ValueError(f"observer must be x, y in the world, of shape (2,); got {tuple(place.shape)}")
@@ -100,11 +115,11 @@ def _observer(surface: HeightField, observer: Array | Sequence[float]) -> Tensor
     return place
 
 
-def _above(ground: HeightField, place: Tensor, height: float) -> Tensor:
+def _above(ground: Terrain, place: Tensor, height: float) -> Tensor:
     return torch.cat((place, ground.jet(place, 0)[0][None] + height))
 
 
-def _lowered(surface: HeightField, place: Tensor, earth_radius: float | None, refraction: float) -> HeightField:
+def _lowered(surface: Terrain, place: Tensor, earth_radius: float | None, refraction: float) -> Terrain:
     """The ground as it appears from a place, in float64; the same one of a flat earth."""
     if earth_radius is None:
         return surface.detached
