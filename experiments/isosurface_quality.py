@@ -101,8 +101,16 @@ class Figure(Sampled):
     zooms: list[Zoom] = Field(default_factory=list)
     boundary: BoundaryName = "mirror"
 
+    @property
+    def level(self) -> float:
+        """The value on the surface."""
+        assert self.surface.level is not None
+        return self.surface.level
+
     @model_validator(mode="after")
     def _consistent(self) -> Figure:
+        if self.surface.level is None:
+            raise ValueError("surface.slim: what is compared here are level sets; give a level")
         if self.noise and self.signal is None:
             raise ValueError("noise: it is added to the samples of a signal; a scan has its own, leave it out")
         if self.look.error is not None and self.signal is None:
@@ -210,11 +218,11 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
 
 def _surface(config: Config, figure: Figure, name: str, recipe: Recipe | None, run: Run) -> Surface:
     if name == TRUTH:
-        return SignalSurface(_signal(figure), figure.surface.level, SAMPLES)
+        return SignalSurface(_signal(figure), figure.level, SAMPLES)
     volume = run.memo(f"volume:{figure.title}", lambda: _volume(config, figure))
     if recipe is None:
-        return triangles.marching_cubes(volume, figure.surface.level, figure.boundary)
-    return LevelSet(recipe.build(volume, figure.boundary), figure.surface.level)
+        return triangles.marching_cubes(volume, figure.level, figure.boundary)
+    return LevelSet(recipe.build(volume, figure.boundary), figure.level)
 
 
 def _signal(figure: Figure) -> Signal:
@@ -289,7 +297,7 @@ def _material(figure: Figure) -> Material:
     assert isinstance(material, scene.PhongModel)
     limit = figure.look.error
     transfer = TransferFunction([0, limit / 2, limit], [LOW, MIDDLE, HIGH], [1, 1, 1])
-    colors = ByField(SurfaceDistance(_signal(figure), figure.surface.level), transfer)
+    colors = ByField(SurfaceDistance(_signal(figure), figure.level), transfer)
     return Phong(colors, material.ambient, material.diffuse, material.specular, material.shininess)
 
 
@@ -297,5 +305,5 @@ def _errors(figure: Figure, points: Tensor) -> dict[str, Any]:
     """Of the points that are seen of a sampled signal: distances to its surface, in voxels."""
     if figure.signal is None or not len(points):
         return {}
-    distance = SurfaceDistance(_signal(figure), figure.surface.level)(points.double())
+    distance = SurfaceDistance(_signal(figure), figure.level)(points.double())
     return {"distance_median": number(distance.median()), "distance_most": number(distance.quantile(MOST))}

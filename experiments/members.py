@@ -316,7 +316,12 @@ class Scan:
         return start, size
 
 
+def largest_extent(n: int) -> int:
+    """Coarse voxels along an axis of n of a scan."""
+    return (min(n, _LARGEST) + 1) // 2
+
+
 def least_extent(shape: Sequence[int]) -> int:
     """Coarse voxels along the longest axis in the smallest part of a scan of that shape."""
-    coarse = max((min(n, _LARGEST) + 1) // 2 for n in shape)
+    coarse = max(map(largest_extent, shape))
     return min(round(high * coarse) - round(low * coarse) for low, high in _PARTS.values())

@@ -11,13 +11,12 @@ resolutions. It shows only where the signal is resolved, so a study names the re
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import torch
 from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
-import filterlab as fl
 from experiments.config import (
     BoundaryName,
     Dtype,
@@ -31,6 +30,7 @@ from experiments.config import (
 )
 from experiments.runs import Record, Run, Unit, timed
 from filterlab import metrics
+from filterlab.fields.base import Domain
 from filterlab.io.config import StrictModel
 from filterlab.scenes.model import SignalModel
 from filterlab.signals import Signal
@@ -162,7 +162,16 @@ class Truth(NamedTuple):
         }
 
 
-def uniform_points(field: fl.Field, count: int, inner: float, seed: int, dtype: torch.dtype, device: str) -> Tensor:
+class Known(Protocol):
+    """What is known exactly: a signal, or a scan held out from itself."""
+
+    @property
+    def domain(self) -> Domain: ...
+
+    def value_and_gradient(self, points: Tensor, /) -> tuple[Tensor, Tensor]: ...
+
+
+def uniform_points(field: Known, count: int, inner: float, seed: int, dtype: torch.dtype, device: str) -> Tensor:
     """`count` uniform world points `(count, 3)` in the field's box shrunk to `inner`; the same on any device."""
     generator = torch.Generator().manual_seed(seed)
     unit = torch.rand(count, 3, generator=generator, dtype=torch.float64)
@@ -171,7 +180,7 @@ def uniform_points(field: fl.Field, count: int, inner: float, seed: int, dtype: 
     return field.domain.geometry.to_world(center + inner * half * (2 * unit - 1)).to(dtype=dtype, device=device)
 
 
-def evaluate(field: fl.Field, points: Tensor) -> tuple[Tensor, Tensor]:
+def evaluate(field: Known, points: Tensor) -> tuple[Tensor, Tensor]:
     """Values `(P)` and gradients `(P, 3)` at the points `(P, 3)`, in bounded memory."""
     with torch.no_grad():
         parts = [field.value_and_gradient(chunk) for chunk in points.split(CHUNK)]

@@ -5,10 +5,10 @@ and by planes. Rays down the normals of other points of the surface meet the cov
 
     rms = √ mean (t̃ − t)²,    in parts of the diagonal of the surface's box
 
-so that rms ∝ 1 / ballsᵖ has p = 3/2 for fits of second order (h³, with h² ∝ 1 / balls) and 1 for planes. Triangles stand
-beside them: a grid in the surface's two parameters with all vertices on it, of as many triangles as there are balls,
-and of as many as it takes to be as near as the blended cover. A scan in a file has no surface but its points: their own
-distances are told, to first order.
+so that rms ∝ 1 / ballsᵖ has p = 3/2 for fits of second order (h³, with h² ∝ 1 / balls) and 1 for planes. Triangles
+stand beside them: a grid in the surface's two parameters with all vertices on it, of as many triangles as there are
+balls, and of as many as it takes to be as near as the blended cover. A scan in a file has no surface but its points:
+their own distances are told, to first order.
 """
 
 from __future__ import annotations

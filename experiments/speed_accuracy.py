@@ -9,8 +9,9 @@ accurate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
@@ -24,13 +25,15 @@ from experiments.config import (
     Dtype,
     Recipe,
     Recipes,
+    VolumeChoice,
     check_signal,
     increasing,
     torch_dtype,
 )
 from experiments.dvr_signal import amplified_difference, image_errors
 from experiments.fronts import front
-from experiments.rms_error import Truth, angles, evaluate
+from experiments.held_out import HeldOut, resolution_of
+from experiments.rms_error import Truth, angles, evaluate, uniform_points
 from experiments.runs import Record, Run, Unit
 from experiments.timing import CLOCKS, TimedConfig, along_rays, cost_record, quartile_record
 from experiments.views import Silent, View
@@ -38,6 +41,7 @@ from filterlab.costs import Quartiles, measure, take_turns
 from filterlab.io.config import StrictModel
 from filterlab.methods import scheme_named
 from filterlab.scenes.model import SignalModel
+from filterlab.signals import Signal
 
 WORK: dict[str, tuple[str, int]] = {  # name -> where the points lie, order of the jet
     "value-rays": ("rays", 0),
@@ -92,6 +96,44 @@ class Source(StrictModel):
     inner: Annotated[float, Field(gt=0, le=1)] = 0.9
     view: View | None = None
 
+    @property
+    def name(self) -> str:
+        return self.signal.name
+
+    @property
+    def label(self) -> str:
+        return self.signal.label
+
+    def open(self, device: str) -> Signal:
+        """What is known exactly."""
+        return self.signal.build()
+
+    def check(self, path: str) -> None:
+        """Raises ConfigError unless it can be evaluated."""
+        check_signal(self.signal, f"{path}signal")
+
+
+class ScanSource(StrictModel):
+    """A scan that is held out from itself; points keep away from where the cube was cut out of it."""
+
+    volume: VolumeChoice
+    inner: Annotated[float, Field(gt=0, le=1)] = 0.8
+    view: None = None
+
+    @property
+    def name(self) -> str:
+        return Path(self.volume.file).name
+
+    @property
+    def label(self) -> str:
+        return f"{self.name}, low-passed and decimated by two"
+
+    def open(self, device: str) -> HeldOut:
+        return HeldOut.of(self.volume.load().samples, device)
+
+    def check(self, path: str) -> None:
+        self.volume.check(f"{path}volume")
+
 
 class ImageStudy(StrictModel):
     """Images of some methods at some resolutions and steps (voxels); those of `shown` (resolution, step) are kept."""
@@ -107,6 +149,8 @@ class Config(TimedConfig):
     """Speed against accuracy.
 
     Attributes:
+        volume: a scan, in place of all sources, resolutions and images: what is true of it is known by hold-out
+            (`experiments.held_out`), at the one resolution that it has.
         methods: without scheme, sampler and storage, which the variants give.
         points: for the errors. `timed_points`: for the times.
         seconds: of timing, for each resolution and kind of work. `image_seconds`: for each set of images.
@@ -115,6 +159,7 @@ class Config(TimedConfig):
     """
 
     experiment: Literal["speed_accuracy"]
+    volume: VolumeChoice | None = None
     sources: Annotated[list[Source], Field(min_length=1)]
     resolutions: Resolutions
     methods: Recipes
@@ -148,44 +193,59 @@ class Config(TimedConfig):
         return self
 
     @property
+    def subjects(self) -> Sequence[Source | ScanSource]:
+        """The sources, or the scan."""
+        return self.sources if self.volume is None else [ScanSource(volume=self.volume)]
+
+    @property
+    def sizes(self) -> list[int]:
+        """Resolutions that are measured."""
+        return self.resolutions if self.volume is None else [resolution_of(self.volume.header().shape)]
+
+    @property
+    def studies(self) -> list[ImageStudy]:
+        """Those of images: nothing draws the truth of a scan as finely as a signal's."""
+        return self.images if self.volume is None else []
+
+    @property
     def candidates(self) -> list[Candidate]:
         """Every method in every variant that it offers."""
         return [c for v in self.variants for recipe in self.methods if (c := v.of(recipe)) is not None]
 
 
 def check(config: Config, path: str = "") -> None:
-    """Raises ConfigError unless the signals can be evaluated, drawn and compared."""
-    for i, source in enumerate(config.sources):
-        check_signal(source.signal, f"{path}sources[{i}].signal")
-        if source.view is not None and config.images:
+    """Raises ConfigError unless the signals, or the scan, can be evaluated, drawn and compared."""
+    for i, source in enumerate(config.subjects):
+        source.check(f"{path}sources[{i}]." if config.volume is None else path)
+        if isinstance(source, Source) and source.view is not None and config.studies:
             _fine(config, source).check(_signal(config, source).domain, f"{path}sources[{i}].view", compared=True)
 
 
 def units(config: Config) -> list[Unit]:
     """Times; errors; images of each signal itself and of its reconstructions; then what follows from them."""
     work = []
-    for n in config.resolutions:
+    for n in config.sizes:
         seconds = 1.2 * config.seconds + len(config.candidates) * (n / 64) ** 3 * 0.01
         work += [Unit(f"cost/{n}/{name}", f"times at {n}³, {name}", seconds) for name in WORK]
-    for i, source in enumerate(config.sources):
-        name, each = source.signal.name, 0.02 + config.points * 1e-6
+    for i, source in enumerate(config.subjects):
+        name, each = source.name, 0.02 + config.points * 1e-6
         work += [
             Unit(f"error/{i}/{n}/{c.key}", f"{name} {n}³, {c.key}", each)
-            for n in config.resolutions
+            for n in config.sizes
             for c in config.candidates
         ]
-    for i, source in enumerate(config.sources):
-        if source.view is not None and config.images:
+    for i, source in enumerate(config.subjects):
+        if source.view is not None and config.studies:
             work += _image_units(config, i, source)
-    fronts = [Unit(f"front/{i}", f"{s.signal.name}, fronts", 0.1) for i, s in enumerate(config.sources)]
+    fronts = [Unit(f"front/{i}", f"{s.name}, fronts", 0.1) for i, s in enumerate(config.subjects)]
     return [*work, *fronts, Unit("claims", "what the paper says", 0.1)]
 
 
 def _image_units(config: Config, i: int, source: Source) -> list[Unit]:
-    name = source.signal.name
+    name = source.name
     seconds = 4.0 * _pixels(source) * config.finest / 1e8
     work = [Unit(f"truth/{i}", f"{name} itself, drawn finely", seconds)]
-    for j, study in enumerate(config.images):
+    for j, study in enumerate(config.studies):
         seconds = 1.5 * config.image_seconds
         work += [Unit(f"images/{i}/{j}/{n}", f"{name} {n}³, images: {study.title}", seconds) for n in study.resolutions]
     return work
@@ -202,10 +262,10 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
     if what == "cost":
         return {"kind": what, "resolution": int(rest[0]), "work": rest[1], **_cost(config, int(rest[0]), rest[1], run)}
     if what == "claims":
-        names = [s.signal.name for s in config.sources]
-        return {"kind": what, "claims": judged(Evidence(run.records, config.resolutions, names))}
+        names = [s.name for s in config.subjects]
+        return {"kind": what, "claims": judged(Evidence(run.records, config.sizes, names))}
     index = int(rest[0])
-    common = {"kind": what, "source": index, "signal": config.sources[index].signal.label}
+    common = {"kind": what, "source": index, "signal": config.subjects[index].label}
     if what == "error":
         return {**common, "resolution": int(rest[1]), **_error(config, index, int(rest[1]), rest[2], run)}
     if what == "truth":
@@ -222,7 +282,7 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
 
 def _cost(config: Config, n: int, work: str, run: Run) -> Record:
     where, order = WORK[work]
-    signal = config.sources[0].signal.build()
+    signal = _opened(config, 0, run)
     volumes = {v.dtype: signal.sample(n, dtype=torch_dtype(v.dtype), device=config.device) for v in config.variants}
     rays = along_rays(signal, config.timed_points, 0.5 / n, config.device)
     if where == "random":
@@ -239,20 +299,24 @@ def _builder(candidate: Candidate, volume: fl.Volume, boundary: str) -> Callable
 
 
 def _error(config: Config, index: int, n: int, key: str, run: Run) -> Record:
-    source = config.sources[index]
+    source = config.subjects[index]
     candidate = next(c for c in config.candidates if c.key == key)
-    truth = run.memo(f"truth:{index}", lambda: _exactly(config, source))
-    volume = run.memo(f"volume:{index}/{n}", lambda: source.signal.build().sample(n, device=config.device))
+    known = _opened(config, index, run)
+    truth = run.memo(f"truth:{index}", lambda: _exactly(config, source, known))
+    volume = run.memo(f"volume:{index}/{n}", lambda: known.sample(n, device=config.device))
     points = truth.points.to(torch_dtype(candidate.variant.dtype))
     value, gradient = (t.double() for t in evaluate(candidate.field(volume, config.boundary), points))
     return {**candidate.record(), **truth.errors(value, gradient), **angles(gradient, truth.gradient)}
 
 
-def _exactly(config: Config, source: Source) -> Truth:
-    """The signal in float64, at points that float32 holds: every variant is asked at the same ones."""
-    truth = Truth.of(source.signal.build(), config.points, source.inner, config.seed, torch.float32, config.device)
-    points = truth.points.double()
-    return Truth(points, *evaluate(source.signal.build(), points))
+def _opened(config: Config, index: int, run: Run) -> Signal | HeldOut:
+    return run.memo(f"source:{index}", lambda: config.subjects[index].open(config.device))
+
+
+def _exactly(config: Config, source: Source | ScanSource, known: Signal | HeldOut) -> Truth:
+    """What is known in float64, at points that float32 holds: every variant is asked at the same ones."""
+    points = uniform_points(known, config.points, source.inner, config.seed, torch.float32, config.device).double()
+    return Truth(points, *evaluate(known, points))
 
 
 def _signal(config: Config, source: Source) -> fl.Field:
@@ -275,7 +339,7 @@ def _truth(config: Config, source: Source, index: int, run: Run) -> Record:
 
 def _images(config: Config, index: int, study: str, n: str, run: Run) -> Record:
     """Every method with every step: drawn once and compared with the truth, then timed in turn."""
-    source, chosen, resolution = config.sources[index], config.images[int(study)], int(n)
+    source, chosen, resolution = config.sources[index], config.studies[int(study)], int(n)
     volume = source.signal.build().sample(resolution, dtype=torch.float32, device=config.device)
     truth = run.memo(f"image:{index}", lambda: run.load_array(run.records[f"truth/{index}"]["array"]))
     calls, entries, files = {}, [], []
@@ -314,7 +378,7 @@ def _fronts(config: Config, index: int, records: Mapping[str, Record]) -> list[R
     found = []
     for error, work in (("value_rms", "value-rays"), ("gradient_rms", "gradient-rays")):
         everyone = {}
-        for n in config.resolutions:
+        for n in config.sizes:
             costs = records[f"cost/{n}/{work}"]["costs"]
             errors = {c.key: records[f"error/{index}/{n}/{c.key}"] for c in _taking_part(config, error)}
             points = {f"{n}/{k}": (costs[k]["ns_per_sample"][1], e[error]) for k, e in errors.items()}
@@ -332,9 +396,9 @@ def _taking_part(config: Config, error: str) -> list[Candidate]:
 
 def _image_fronts(config: Config, index: int, records: Mapping[str, Record]) -> list[Record]:
     found = []
-    for n in sorted({n for study in config.images for n in study.resolutions}):
+    for n in sorted({n for study in config.studies for n in study.resolutions}):
         points = {}
-        for j in range(len(config.images)):
+        for j in range(len(config.studies)):
             for entry in records.get(f"images/{index}/{j}/{n}", {}).get("entries", ()):
                 points[f"{n}/{entry['recipe']}@{entry['step']:g}"] = (entry["milliseconds"][1], entry["rms"])
         if points:

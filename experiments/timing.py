@@ -13,8 +13,8 @@ import torch
 from pydantic import model_validator
 from torch import Tensor
 
-import filterlab as fl
 from experiments.config import ExperimentConfig
+from experiments.rms_error import Known
 from experiments.runs import Record
 from filterlab.costs import Clock, Cost, Quartiles, per_round
 
@@ -42,7 +42,7 @@ class TimedConfig(ExperimentConfig):
         return f"CPU time of {threads}" if self.clock == "cpu" else f"wall-clock time on {threads}"
 
 
-def along_rays(field: fl.Field, count: int, spacing: float, device: str = "cpu") -> Tensor:
+def along_rays(field: Known, count: int, spacing: float, device: str = "cpu") -> Tensor:
     """`count` world points `(count, 3)`, float32, on slanted parallel rays through the field's box, `spacing` apart.
 
     Ray after ray on a square grid; the rays fill the box shrunk to nine tenths about its centre. `spacing` is along z,

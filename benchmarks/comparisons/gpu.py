@@ -23,11 +23,13 @@ from benchmarks.scene import Scene, blobs, marschner_lobb, without_skipping
 from benchmarks.settings import Settings
 from filterlab import ops
 from filterlab.kernels import bspline
+from filterlab.methods import METHODS, Tetrahedral, reconstruct
 from filterlab.ops.differentiable.prefilter import prefilter_samples
 from filterlab.roots import first_root
 
 _POINTS = 16  # times as many as elsewhere
 _IMAGE = 4  # times the edge
+_TETRAHEDRAL = tuple(name for name, method in METHODS.items() if isinstance(method, Tetrahedral))
 _FLOATS = 3 + 4  # of a point and of its rows
 
 
@@ -94,6 +96,18 @@ def _jets(settings: Settings, arrangement: str) -> Race:
         return _finished(cupy_texture.NAME, cupy_texture.triquadratic(volume, points), None, count)
 
     return _with_peers(race, [(cupy_texture, textured)])
+
+
+def _on_tetrahedra(settings: Settings, arrangement: str) -> Race:
+    """Splines on tetrahedra against the tensor product of the same accuracy."""
+    volume = workloads.noise(settings.voxels).cuda()
+    points = workloads.points(arrangement, settings.voxels, _POINTS * settings.points).cuda()
+    fields = {name: reconstruct(volume, name) for name in ("triquadratic", *_TETRAHEDRAL)}
+    contestants = [
+        _finished(name, partial(field.value_and_gradient, points), None, len(points)) for name, field in fields.items()
+    ]
+    ratios = [Ratio(name, "triquadratic") for name in _TETRAHEDRAL]
+    return Race(f"value + gradient, {len(points):,} points, {arrangement}", contestants, ratios)
 
 
 def _splats(settings: Settings, arrangement: str) -> Race:
@@ -223,7 +237,8 @@ def _hits(settings: Settings) -> Race:
         _finished("program", lambda: (surface.field.first_crossing(*rays, task.level),), None, task.rays)
     )
     what = f"{surfaces.described(task)}: first hits and normals; triquadratic hits alone: program"
-    return Race(what, contestants, [Ratio("triquadratic", "trilinear"), Ratio("triquadratic", "program")])
+    ratios = [Ratio("triquadratic", "trilinear"), Ratio("triquadratic", "program")]
+    return Race(what, contestants, ratios + [Ratio(name, "triquadratic") for name in _TETRAHEDRAL])
 
 
 def _hits_direct(settings: Settings) -> Race:
@@ -265,6 +280,7 @@ def _roots(settings: Settings, dtype: torch.dtype) -> Race:
 
 _ITEMS: dict[str, tuple[float, Callable[[Settings], Race]]] = {
     **{f"jets-{a}": (5, partial(_jets, arrangement=a)) for a in workloads.ARRANGEMENTS},
+    **{f"tetrahedra-{a}": (15, partial(_on_tetrahedra, arrangement=a)) for a in workloads.ARRANGEMENTS},
     **{f"splats-{a}": (5, partial(_splats, arrangement=a)) for a in workloads.ARRANGEMENTS},
     "prefilter-quadratic": (5, partial(_prefilter, name="quadratic", order=2)),
     "prefilter-cubic": (5, partial(_prefilter, name="cubic", order=3)),

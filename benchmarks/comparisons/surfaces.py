@@ -13,7 +13,7 @@ from torch import Tensor
 
 from benchmarks.comparisons.scaling import thread_numbers
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, Tick, race_item, usable_cores
-from benchmarks.peers import casters, embree_mesh, isoray, mitsuba_sdfgrid, vtk_flying_edges, vtk_raycaster
+from benchmarks.peers import casters, embree_mesh, isoray_bisection, mitsuba_sdfgrid, vtk_flying_edges, vtk_raycaster
 from benchmarks.peers.task import Casting
 from benchmarks.probe import measured
 from benchmarks.records import Figure, Outcome, Spread, at_least, at_most
@@ -101,12 +101,12 @@ def _bisecting(settings: Settings) -> Race:
     """Few rays: each takes as long as some hundred of ours."""
     task, absent = task_of(settings, _BISECTED), {}
     contestants, ratios = [_hits(task, "trilinear")], []
-    if why := isoray.missing():
-        absent[isoray.NAME] = why
+    if why := isoray_bisection.missing():
+        absent[isoray_bisection.NAME] = why
     else:
-        contestants.append(isoray.bisecting(task))
-        ratios.append(Ratio("trilinear", isoray.NAME))
-    what = f"{described(task)}: first hits and normals; {isoray.NAME} without"
+        contestants.append(isoray_bisection.bisecting(task))
+        ratios.append(Ratio("trilinear", isoray_bisection.NAME))
+    what = f"{described(task)}: first hits and normals; {isoray_bisection.NAME} without"
     return Race(what, contestants, ratios, tolerance=_BORDER / task.volume.shape[-1], absent=absent)
 
 

@@ -25,7 +25,7 @@ _NAMES = (
     "mitsuba_sdfgrid",
     "embree_mesh",
     "vtk_flying_edges",
-    "isoray",
+    "isoray_bisection",
 )
 
 PEERS: tuple[ModuleType, ...] = tuple(import_module(f"benchmarks.peers.{name}") for name in _NAMES)

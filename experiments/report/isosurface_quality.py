@@ -74,7 +74,7 @@ def _whole_caption(figure: Figure) -> str:
     else:
         assert figure.volume is not None
         what = figure.volume.file.rpartition("/")[2].rpartition(":")[2]
-    caption = f"{what}, level {figure.surface.level:g}, boundary {figure.boundary}; {width} × {height} pixels."
+    caption = f"{what}, level {figure.level:g}, boundary {figure.boundary}; {width} × {height} pixels."
     if figure.look.error is not None:
         caption += f" Colour: distance to the signal's surface, from blue, none, to red, {figure.look.error:g} voxels."
     if figure.signal is not None:

@@ -29,14 +29,14 @@ QUANTITIES = {"value_rms": "value", "gradient_rms": "gradient"}
 
 def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section:
     """The section of the report."""
-    middle = config.resolutions[len(config.resolutions) // 2]
+    middle = config.sizes[len(config.sizes) // 2]
     blocks: list[Block] = []
     if f"cost/{middle}/gradient-rays" in records:
         blocks += _overview(config, records, 0, middle)
     parts = [
         _paper(config, records),
-        *(_fronts(config, records, i) for i in range(len(config.sources))),
-        *(_images(config, records, i, folder) for i in range(len(config.sources))),
+        *(_fronts(config, records, i) for i in range(len(config.subjects))),
+        *(_images(config, records, i, folder) for i in range(len(config.subjects))),
         _schemes(config, records, middle),
         _precision(config, records),
     ]
@@ -50,15 +50,24 @@ def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section
 
 
 def _lead(config: Config) -> list[str]:
-    names = " and ".join(s.signal.label for s in config.sources)
+    names = " and ".join(s.label for s in config.subjects)
     return [
         f"{len(config.methods)} methods in {len(config.variants)} variants (scheme, arithmetic, storage), at "
-        f"{', '.join(f'{n}³' for n in config.resolutions)}, are compared with the signals {names}, which are known "
-        "exactly. A candidate is worth its cost, on the front, where nobody who costs less is as accurate (by 2 %).",
+        f"{', '.join(f'{n}³' for n in config.sizes)}, are compared with {_known(config, names)}. A candidate is worth "
+        "its cost, on the front, where nobody who costs less is as accurate (by 2 %).",
         f"All candidates of one resolution are timed in turn, round after round ({config.timed_by}): medians over "
         "rounds, ratios within rounds. Points lie along slanted parallel rays, half a voxel apart, unless said "
         "otherwise.",
     ]
+
+
+def _known(config: Config, names: str) -> str:
+    if config.volume is None:
+        return f"the signals {names}, which are known exactly"
+    return (
+        f"{names}: the low-passed scan, by its quintic B-spline, is what is true of a cube of every second voxel of "
+        "it. Values are in parts of the range of the cube, lengths in voxels of the scan"
+    )
 
 
 def _in_short(config: Config, records: Mapping[str, Record], n: int) -> list[str]:
@@ -72,7 +81,7 @@ def _in_short(config: Config, records: Mapping[str, Record], n: int) -> list[str
             for k in members
         )
         said.append(
-            f"In short, {config.sources[0].signal.label} at {n}³: worth their cost for value and gradient (RMS error "
+            f"In short, {config.subjects[0].label} at {n}³: worth their cost for value and gradient (RMS error "
             f"of the gradient) are {listed}."
         )
     claims = [c["verdict"] for c in records.get("claims", {}).get("claims", ())]
@@ -112,7 +121,7 @@ def _overview(config: Config, records: Mapping[str, Record], index: int, n: int)
     if not first:
         return []
     caption = (
-        f"At a glance: {config.sources[index].signal.label} at {n}³, {config.variants[0].name}, fastest scheme. "
+        f"At a glance: {config.subjects[index].label} at {n}³, {config.variants[0].name}, fastest scheme. "
         "Gradients are per world unit, timed together with the value; angles where the gradient is longer than 1 % of "
         "the longest. Last column: the fronts of error against time that the method is on, and in which precision "
         "where it is another."
@@ -183,7 +192,7 @@ def _paper(config: Config, records: Mapping[str, Record]) -> Section:
         "Here every sentence is a ratio with a limit, on this machine.",
     )
     return Section(
-        "What the paper says, and what holds here", lead, [claims_table(found, config.resolutions)] if found else []
+        "What the paper says, and what holds here", lead, [claims_table(found, config.sizes)] if found else []
     )
 
 
@@ -192,13 +201,13 @@ def _fronts(config: Config, records: Mapping[str, Record], index: int) -> Sectio
     if front is None:
         return Section("")
     blocks: list[Block] = [fronts_plot(config, records, index, name)]
-    chosen = [(n, key) for n in config.resolutions for key in _in_order(records, index, n)]
+    chosen = [(n, key) for n in config.sizes for key in _in_order(records, index, n)]
     caption = (
         "The members of the fronts of error against time, cheapest first. ÷ usual: time of value and gradient in units "
         "of trilinear interpolation with central differences. Build: prefilter and padding."
     )
     blocks += [_table(config, records, index, chosen, caption), memory_plot(config, records, index, name)]
-    return Section(f"The front: {config.sources[index].signal.label}", (), blocks)
+    return Section(f"The front: {config.subjects[index].label}", (), blocks)
 
 
 def _in_order(records: Mapping[str, Record], index: int, n: int) -> list[str]:
@@ -210,7 +219,7 @@ def _images(config: Config, records: Mapping[str, Record], index: int, folder: P
     studies = [r for r in records.values() if r["kind"] == "images" and r["source"] == index]
     if not studies:
         return Section("")
-    source = config.sources[index]
+    source = config.subjects[index]
     assert source.view is not None
     blocks: list[Block] = [images_plot(config, records, index, studies)]
     width, height = source.view.size
@@ -218,13 +227,13 @@ def _images(config: Config, records: Mapping[str, Record], index: int, folder: P
     truth = records.get(f"truth/{index}")
     if shown and truth is not None:
         blocks += _galleries(config, truth, shown, folder)
-    blocks += [_image_table(config, r) for r in studies if len(config.images[r["study"]].steps) == 1]
+    blocks += [_image_table(config, r) for r in studies if len(config.studies[r["study"]].steps) == 1]
     lead = (
         f"{width} × {height} pixels, compared as displayed (sRGB) with an image of the signal itself of "
         f"{config.finest} samples across its box. An image is wrong because of its reconstruction and because of its "
         "step; where the step decides, a better method buys nothing.",
     )
-    return Section(f"Images: {source.signal.label}", lead, blocks)
+    return Section(f"Images: {source.label}", lead, blocks)
 
 
 def _galleries(config: Config, truth: Record, shown: Sequence[tuple[Record, Record]], folder: Path) -> list[Block]:
@@ -262,7 +271,7 @@ def _image_table(config: Config, record: Record) -> Table:
         )
         cells = [fixed(e["psnr"], 2), fixed(e["ssim"], 4), text(e["max"], 2), median, f"{low} … {high}"]
         rows.append([", ".join([label(e), *how]), *cells])
-    study = config.images[record["study"]]
+    study = config.studies[record["study"]]
     caption = f"{study.title.capitalize()}: images at {record['resolution']}³, step {study.steps[0]:g} (voxels)."
     return Table(columns, rows, caption)
 

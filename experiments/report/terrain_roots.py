@@ -68,7 +68,7 @@ def _plot(records: Sequence[Record]) -> Plot:
             own = [r for r in records if r["dtype"] == dtype]
             heights = [_share(r, solver, BAD) for r in own]
             places = [names.index(r["family"]) for r in own]
-            axes.plot(places, heights, look.marker, color=look.light, label=f"{solver}, {dtype}")
+            axes.plot(places, heights, look.marker, color=look.light, label=f"{solver}, {dtype}", clip_on=False)
         axes.set_yscale("symlog", linthresh=0.01)
         axes.set_ylim(0, 100)
         axes.set_xticks(range(len(names)), names, rotation=15)

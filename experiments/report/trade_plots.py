@@ -71,10 +71,10 @@ def fronts_plot(config: Config, records: Mapping[str, Record], index: int, name:
     """Error against time per sample: a row for each quantity, a column for each resolution."""
     with plots.settings():
         figure = plots.canvas(10.8, 7.6)
-        grid = figure.subplots(2, len(config.resolutions), squeeze=False, sharex="row")
+        grid = figure.subplots(2, len(config.sizes), squeeze=False, sharex="row")
         for row, (error, work, quantity) in zip(grid, QUANTITIES, strict=True):
             slowest = 0.0
-            for axes, n in zip(row, config.resolutions, strict=True):
+            for axes, n in zip(row, config.sizes, strict=True):
                 found = _points(config, records, index, n, work)
                 slowest = max([slowest, *(r["ns_per_sample"][1] for r in found.values())])
                 _scatter(axes, config, found, error)
@@ -90,7 +90,7 @@ def fronts_plot(config: Config, records: Mapping[str, Record], index: int, name:
         figure.legend(handles=_legend(config), loc="outside lower center", ncols=7, frameon=False)
         drawn = plots.svg(figure, f"fronts-{index}")
     caption = (
-        f"Error against time per sample, {config.sources[index].signal.label}; down and to the left is better. Large "
+        f"Error against time per sample, {config.subjects[index].label}; down and to the left is better. Large "
         f"markers: {config.variants[0].name} (hollow: without prefilter); small hollow ones: other precisions. Bars: "
         "quartiles of time over rounds. The line is the front; its members are numbered and named. Schemes in plain "
         "torch lie far to the right of these plots, see Schemes."
@@ -129,7 +129,7 @@ def memory_plot(config: Config, records: Mapping[str, Record], index: int, name:
         figure = plots.canvas(10.8, 5.0)
         for axes, (error, work, quantity) in zip(figure.subplots(1, 2), QUANTITIES, strict=True):
             found: dict[str, Record] = {}
-            for n in config.resolutions:
+            for n in config.sizes:
                 found |= {f"{n}/{k}": r for k, r in _points(config, records, index, n, work).items()}
             for record in found.values():
                 axes.plot([record["bytes"] / 2**20], [record[error]], **_marker(config, record))
@@ -143,7 +143,7 @@ def memory_plot(config: Config, records: Mapping[str, Record], index: int, name:
         figure.legend(handles=_legend(config), loc="outside lower center", ncols=7, frameon=False)
         drawn = plots.svg(figure, f"memory-{index}")
     caption = (
-        f"Error against memory at {', '.join(f'{n}³' for n in config.resolutions)} together; markers as above. The "
+        f"Error against memory at {', '.join(f'{n}³' for n in config.sizes)} together; markers as above. The "
         "line is the front; its members are numbered and named."
     )
     return Plot(drawn, caption)
@@ -151,7 +151,7 @@ def memory_plot(config: Config, records: Mapping[str, Record], index: int, name:
 
 def images_plot(config: Config, records: Mapping[str, Record], index: int, studies: Sequence[Record]) -> Plot:
     """PSNR against the time of an image: a curve through the steps of every method, a panel for each resolution."""
-    several = [r for r in studies if len(config.images[r["study"]].steps) > 1] or studies
+    several = [r for r in studies if len(config.studies[r["study"]].steps) > 1] or studies
     resolutions = sorted({r["resolution"] for r in several})
     with plots.settings():
         figure = plots.canvas(10.8, 4.2)
@@ -170,7 +170,7 @@ def images_plot(config: Config, records: Mapping[str, Record], index: int, studi
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
         drawn = plots.svg(figure, f"images-{index}")
-    steps = ", ".join(f"{s:g}" for s in config.images[several[0]["study"]].steps)
+    steps = ", ".join(f"{s:g}" for s in config.studies[several[0]["study"]].steps)
     caption = (
         f"PSNR against the time of an image; up and to the left is better. Along each curve from left to right: steps "
         f"of {steps} voxels. Rings: the front."
@@ -238,7 +238,7 @@ def _single(config: Config, record: Record) -> bool:
 
 def precision_plot(config: Config, records: Mapping[str, Record]) -> Plot | None:
     """What a precision does to errors (a row for each signal) and times, at the finest resolution."""
-    n, sources = config.resolutions[-1], [i for i in range(len(config.sources)) if f"front/{i}" in records]
+    n, sources = config.sizes[-1], [i for i in range(len(config.subjects)) if f"front/{i}" in records]
     names = [v.name for v in sorted(config.variants, key=_bits) if v.scheme is None]
     if len(names) < 2 or not sources:
         return None
@@ -246,7 +246,7 @@ def precision_plot(config: Config, records: Mapping[str, Record]) -> Plot | None
     with plots.settings():
         figure = plots.canvas(10.8, 3.3 * len(sources) + 0.5)
         for i, row in zip(sources, figure.subplots(len(sources), 3, squeeze=False), strict=True):
-            signal = config.sources[i].signal.name
+            signal = config.subjects[i].name
             for axes, (error, work, quantity) in zip(row, QUANTITIES, strict=False):
                 _precisions(axes, config, _points(config, records, i, n, work), error, names)
                 axes.set_title(f"{signal}: error of the {quantity} ÷ {first}", fontsize=9)

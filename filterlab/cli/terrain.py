@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from filterlab.cli.loading import Progress, reading
-from filterlab.cli.options import Quiet, check_asked, check_name
+from filterlab.cli.options import Maybe, Quiet, check_asked, check_name
 from filterlab.cli.outcome import UsageError
 from filterlab.cli.saving import OutputFile
 from filterlab.cli.terminal import progress_bar, show
@@ -48,12 +48,12 @@ class Terrain:
 
     file: Annotated[Positional[Path], arg(metavar="HEIGHTS")]
     """The heights."""
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE")] = None
+    output: Annotated[Maybe[Path], arg(aliases=["-o"], metavar="FILE")] = None
     """The picture to write: a name that ends in .png or .jpg; a file of that name is replaced. With --frames .gif, .png
     (animated), or a folder for numbered .png files, which must be new or empty."""
     spline: str = "c1"
     """How heights become a surface: linear, c0, c1 or c2 (smoother, and farther from the heights)."""
-    exaggeration: Annotated[float | None, arg(metavar="E")] = None
+    exaggeration: Annotated[Maybe[float], arg(metavar="E")] = None
     """How many times as high as it is the ground stands; default as its relief suggests, 1 for mountains."""
     sun: Annotated[Two, arg(metavar="AZIMUTH ALTITUDE")] = (315.0, 38.0)
     """Where the sun stands: degrees from north, clockwise, and above the horizon."""
@@ -61,17 +61,17 @@ class Terrain:
     """Where the camera looks: degrees from north, clockwise, and down."""
     color: str = "hypsometric"
     """A colormap, by height (hypsometric, terrain, viridis, …); slope, aspect, normal, hillshade; or one colour."""
-    range: Annotated[Two | None, arg(metavar="LOW HIGH")] = None
+    range: Annotated[Maybe[Two], arg(metavar="LOW HIGH")] = None
     """Heights (slopes, azimuths) at both ends of the colours; default those that there are."""
-    drape: Annotated[Path | None, arg(metavar="PICTURE")] = None
+    drape: Annotated[Maybe[Path], arg(metavar="PICTURE")] = None
     """A picture instead of colours: PNG or JPEG that covers the map, or a GeoTIFF with its own place."""
     material: str = "matt"
     """Of the ground: matt; reflection_lines or mirror, which show how smooth it is."""
-    sky: Annotated[Path | None, arg(metavar="PICTURE")] = None
+    sky: Annotated[Maybe[Path], arg(metavar="PICTURE")] = None
     """What is around: an equirectangular picture; default a clear sky."""
-    water: Annotated[float | None, arg(metavar="LEVEL")] = None
+    water: Annotated[Maybe[float], arg(metavar="LEVEL")] = None
     """The level of still water, in the unit of the heights."""
-    haze: Annotated[float | None, arg(metavar="METRES")] = None
+    haze: Annotated[Maybe[float], arg(metavar="METRES")] = None
     """How far one sees: at that distance 1/e of a colour is left."""
     size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (960, 600)
     """Of the picture in pixels."""
@@ -85,13 +85,13 @@ class Terrain:
     """Make heights that are missing from those around."""
     legend: bool = False
     """Add the colours and their values to the picture."""
-    frames: Annotated[int | None, arg(metavar="N")] = None
+    frames: Annotated[Maybe[int], arg(metavar="N")] = None
     """Make N pictures: a whole turn of the camera; or along a --path."""
-    path: Annotated[Path | None, arg(metavar="FLIGHT.yaml")] = None
+    path: Annotated[Maybe[Path], arg(metavar="FLIGHT.yaml")] = None
     """The points of a flight: x, y as in the file of heights, and metres above the ground (docs/terrain.md)."""
-    band: Annotated[int | None, arg(metavar="B")] = None
+    band: Annotated[Maybe[int], arg(metavar="B")] = None
     """Which of several bands of a GeoTIFF, from 1."""
-    unit: Annotated[str | None, arg(metavar="NAME")] = None
+    unit: Annotated[Maybe[str], arg(metavar="NAME")] = None
     """Of x and y, where the file declares none: metre, degree, foot, …"""
     seed: int = 0
     """Of the places of rays within pixels."""

@@ -12,9 +12,13 @@ from experiments import speed_accuracy
 from experiments.claims import CENTRAL, CLAIMS, Claim, Evidence, judged, verdict
 from experiments.config import Recipe
 from experiments.fronts import front
+from experiments.held_out import HeldOut, resolution_of
+from experiments.report.speed_accuracy import draw
 from experiments.rms_error import uniform_points
 from experiments.runs import Run
 from experiments.speed_accuracy import Variant
+from filterlab import Volume, load_volume, save_volume
+from filterlab.io.config import ConfigError, loads_config
 
 
 def test_without_ties_the_front_is_whom_nobody_beats():
@@ -226,3 +230,56 @@ def test_images_come_nearer_to_the_signal_with_shorter_steps(records):
     assert [key for key, e in entries.items() if "image" in e] == [("triquadratic", 0.5), ("trilinear+central", 0.5)]
     assert not any("image" in e for e in records["images/0/0/8"]["entries"])
     assert len(records["images/0/0/12"]["files"]) == 4
+
+
+# --- a scan -----------------------------------------------------------------------------------------------------------
+
+WAVE = torch.tensor([0.31, -0.22, 0.17], dtype=torch.float64)  # radians per voxel along x, y, z: the low-pass keeps it
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    """A plane wave of amplitude 50 about 300: known in closed form, whatever is held out of it."""
+    z, y, x = torch.meshgrid(*(torch.arange(float(n)).double() for n in (45, 51, 61)), indexing="ij")
+    path = tmp_path_factory.mktemp("scan") / "wave.nrrd"
+    save_volume(Volume(300 + 50 * torch.cos((torch.stack((x, y, z), -1) * WAVE).sum(-1))), path)
+    return path
+
+
+def test_a_scan_is_known_where_every_second_voxel_was_left_out(scan):
+    known = HeldOut.of(load_volume(scan).samples)
+    assert known.volume.size == (23, 23, 23)
+    assert resolution_of((45, 51, 61)) == 23
+    assert (float(known.volume.samples.min()), float(known.volume.samples.max())) == (0.0, 1.0)
+    points = uniform_points(known, 300, 0.35, 0, torch.float64, "cpu")  # the low-pass reaches 12 voxels
+    assert float(points.min()) > 0
+    value, gradient = known.value_and_gradient(points)
+    phase = (points * WAVE).sum(-1)
+    wave, found = torch.cos(phase), known.low + known.span * value - 300
+    amplitude = float((found * wave).sum() / wave.square().sum())
+    assert amplitude == pytest.approx(50, rel=0.005)  # what the low-pass has left of it
+    torch.testing.assert_close(found, amplitude * wave, rtol=0, atol=0.01)
+    expected = -amplitude * torch.sin(phase)[:, None] * WAVE
+    torch.testing.assert_close(known.span * gradient, expected, rtol=0, atol=0.01)
+
+
+def test_a_scan_in_place_of_signals(scan, tmp_path):
+    c = config(volume={"file": str(scan)}, points=400)
+    speed_accuracy.check(c)
+    run = Run(tmp_path, {})
+    units = speed_accuracy.units(c)
+    for unit in units:
+        run.append(unit.key, speed_accuracy.compute(c, unit, run))
+    assert {u.key.split("/")[0] for u in units} == {"cost", "error", "front", "claims"}
+    errors = {r["candidate"]: r["value_rms"] for r in run.records.values() if r["kind"] == "error"}
+    assert errors["triquadratic"] < 0.3 * errors["trilinear+central"] < 0.1
+    section = draw(c, run.records, tmp_path)
+    assert "wave.nrrd" in section.lead[0]
+    with pytest.raises(ConfigError, match="expected a volume file; found none"):
+        speed_accuracy.check(config(volume={"file": "none.nrrd"}))
+
+
+def test_a_scan_is_chosen_on_the_command_line(scan):
+    chosen = loads_config(json.dumps(TINY), speed_accuracy.Config, {"volume.file": str(scan)})
+    assert chosen.volume is not None
+    assert chosen.sizes == [23]

@@ -54,16 +54,22 @@ def test_normals_are_nearer_to_the_function_s_where_splines_are_smoother(run):
 
 
 def test_descent_finds_the_surface_by_depths_and_shades(run):
-    """From half of the relief everywhere to a tenth of where it began."""
+    """From half of the relief everywhere to a fifth of where it began."""
     weights = {"both": {}}
-    content = {"experiment": "inverse_terrain", "description": "x", "samples": 10, "weights": weights}
-    views, descent = {"count": 3, "size": 24, "shown": 8}, {"iterations": 80, "learning_rate": 0.08}
+    content = {
+        "experiment": "inverse_terrain",
+        "description": "x",
+        "samples": 10,
+        "weights": weights,
+        "record_every": 30,
+    }
+    views, descent = {"count": 2, "size": 16, "shown": 8}, {"iterations": 30, "learning_rate": 0.1}
     config = inverse_terrain.Config.model_validate({**content, "views": views, "descent": descent})
     record = inverse_terrain.compute(config, inverse_terrain.units(config)[0], run)
     first, last = (record["observations"][k] for k in (0, -1))
-    assert last["height_rms"] < 0.12 * first["height_rms"]
-    assert last["depth_rms"] < 0.1 * first["depth_rms"]
-    assert last["shade_rms"] < 0.25 * first["shade_rms"]
+    assert last["height_rms"] < 0.2 * first["height_rms"]
+    assert last["depth_rms"] < 0.2 * first["depth_rms"]
+    assert last["shade_rms"] < 0.4 * first["shade_rms"]
     with pytest.raises(ValueError, match="a weight above 0 of depth, of shade, or of both"):
         inverse_terrain.Weights(depth=0, shade=0)
 
@@ -73,9 +79,9 @@ def test_the_patches_of_a_cell_of_c1_depend_on_five_combinations_of_its_nine_dat
     from filterlab.surfaces import HeightField
 
     cells = torch.cartesian_prod(torch.arange(4), torch.arange(4))
-    patches = lambda h: HeightField(h.reshape(12, 12), "c1", boundary="wrap").patches(cells).flatten()  # noqa: E731
-    matrix = torch.autograd.functional.jacobian(patches, torch.zeros(144, dtype=torch.float64))
-    assert int(torch.linalg.matrix_rank(matrix)) == 5 * 16
+    unit = torch.eye(144, dtype=torch.float64).reshape(144, 12, 12)  # a grid for every datum that is 1
+    patches = HeightField(unit, "c1", boundary="wrap").patches(cells)
+    assert int(torch.linalg.matrix_rank(patches.reshape(144, -1))) == 5 * 16
 
 
 def test_files_that_hold_no_heights_are_refused(tmp_path):
