@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.surfaces.graphs import unit
+from filterlab.surfaces.fitting.graphs import unit
 
 _LEAST = 1e-6  # of an edge: 0 is no edge
 

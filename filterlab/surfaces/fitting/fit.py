@@ -1,7 +1,4 @@
-"""From scanned points to a smooth surface: covers of them by balls with local quadrics.
-
-points ──scans──▶ normals, ends, strays ──covering──▶ balls, graphs of second order, cuts ──▶ Slim
-"""
+"""`fit_slim`: what is checked, what is done in turn, and what is told of it."""
 
 from __future__ import annotations
 
@@ -13,9 +10,9 @@ from torch import Tensor
 
 from filterlab.arrays import Array, as_tensor
 from filterlab.surfaces.bounds import check_rows
-from filterlab.surfaces.covering import Cover
-from filterlab.surfaces.graphs import Graphs
-from filterlab.surfaces.scans import NEIGHBORS, scan_of
+from filterlab.surfaces.fitting.covering import Cover
+from filterlab.surfaces.fitting.graphs import Graphs
+from filterlab.surfaces.fitting.scans import NEIGHBORS, scan_of
 from filterlab.surfaces.slim import Fit, Slim
 
 LEAST = 12
@@ -42,7 +39,7 @@ def fit_slim(
     Args:
         points: (N, 3), float32 or float64.
         normals: (N, 3), of any length, towards the outside; only their sides count. None: they are found
-            (`surfaces.orienting`).
+            (`surfaces.fitting.orienting`).
         tolerance: of the diagonal of the points' box, for the root mean square of distances in every ball.
         least: points in a ball, at least: more of them smooth more where noise is larger than the tolerance.
         order: of the local fits: 2, or 1 for planes, to compare with.

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.surfaces.graphs import Graphs, Pairs, fitted, unit
-from filterlab.surfaces.orienting import oriented
+from filterlab.surfaces.fitting.graphs import Graphs, Pairs, fitted, unit
+from filterlab.surfaces.fitting.orienting import oriented
 
 NEIGHBORS = 16  # of a point, by which its normal is found
 _NEAREST = 6  # by which its spacing is

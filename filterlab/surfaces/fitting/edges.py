@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.reference.slim import weight
-from filterlab.surfaces.graphs import Graphs, Pairs, fitted, summed, unit
+from filterlab.surfaces.fitting.graphs import Graphs, Pairs, fitted, summed, unit
 
 CUTS = 4
 """Planes at the ends of what was scanned; one more is at an edge."""

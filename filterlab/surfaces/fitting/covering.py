@@ -7,7 +7,7 @@ is kept whatever its misfit. A point is covered when the weights of the balls th
 
 A ball meets the tolerance if the root of the weighted mean of squared distances of its points is within it, and none
 is further off than four times that. Points whose normals look the other way, as those of a wall behind, are not its
-own. If one graph does not meet it, two are tried that share a sharp edge (`surfaces.edges`).
+own. If one graph does not meet it, two are tried that share a sharp edge (`surfaces.fitting.edges`).
 
 Source: Ohtake, Belyaev & Alexa, Sparse low-degree implicit surfaces with applications to high quality rendering,
 feature extraction, and smoothing, 2005, whose balls minimise an error instead.
@@ -23,9 +23,9 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.reference.slim import weight
-from filterlab.surfaces.edges import by_normals, edges_in, ends_in, highest, none
-from filterlab.surfaces.graphs import Graphs, Pairs, fitted, summed, unit
-from filterlab.surfaces.scans import Progress, Scan, tree_of
+from filterlab.surfaces.fitting.edges import by_normals, edges_in, ends_in, highest, none
+from filterlab.surfaces.fitting.graphs import Graphs, Pairs, fitted, summed, unit
+from filterlab.surfaces.fitting.scans import Progress, Scan, tree_of
 
 ENOUGH = 0.5
 """Sum of weights from which on a point is covered."""
@@ -48,7 +48,7 @@ class Fits(NamedTuple):
 
     Attributes:
         graphs: M. pairs: of points with the graph they belong to. off: (P,) their distances.
-        cuts: (M, K, 4), as in `surfaces.edges`.
+        cuts: (M, K, 4), as in `surfaces.fitting.edges`.
     """
 
     graphs: Graphs
