@@ -75,16 +75,16 @@ def casting_memory(threads: int, voxels: int, size: int) -> dict[str, float]:
     """Peak bytes before and after the first picture of a level set: bounds, hits and normals of size² rays."""
     import torch
 
-    from benchmarks.comparisons.surfaces import hits_and_normals, surface_of, task_of
+    from benchmarks.level_sets import hits_and_normals, surface_of, task_of
     from benchmarks.settings import Settings
 
     torch.set_num_threads(threads)
     small = task_of(Settings(), 8, 8)
-    hits_and_normals(surface_of(small, "triquadratic"), small)  # loaded and compiled
+    hits_and_normals(surface_of(small, "triquadratic"), small.origins, small.directions)  # loaded and compiled
     task = task_of(Settings(), size, voxels)
     surface = surface_of(task, "triquadratic")
     before = _peak()
-    hits_and_normals(surface, task)
+    hits_and_normals(surface, task.origins, task.directions)
     return {"before": before, "peak": _peak()}
 
 

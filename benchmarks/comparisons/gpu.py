@@ -18,6 +18,7 @@ from torch import Tensor
 from benchmarks import workloads
 from benchmarks.comparisons import surfaces
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item
+from benchmarks.level_sets import hits_and_normals, surface_of, task_of
 from benchmarks.peers import cupy_march, cupy_ndimage, cupy_texture
 from benchmarks.scene import Scene, blobs, marschner_lobb, without_skipping
 from benchmarks.settings import Settings
@@ -226,13 +227,13 @@ def _adjoint(settings: Settings, edge: int, schemes: Sequence[str]) -> Race:
 
 def _hits(settings: Settings) -> Race:
     """First hits and normals by every method, and the program alone for one of them."""
-    task = surfaces.task_of(settings, _IMAGE * settings.image, device="cuda")
+    task = task_of(settings, _IMAGE * settings.image, device="cuda")
     rays = task.origins, task.directions
     contestants = [
-        _finished(method, partial(surfaces.hits_and_normals, surfaces.surface_of(task, method), task), None, task.rays)
+        _finished(method, partial(hits_and_normals, surface_of(task, method), *rays), None, task.rays)
         for method in surfaces.SEARCHED
     ]
-    surface = surfaces.surface_of(task, "triquadratic")
+    surface = surface_of(task, "triquadratic")
     contestants.append(
         _finished("program", lambda: (surface.field.first_crossing(*rays, task.level),), None, task.rays)
     )
@@ -242,18 +243,18 @@ def _hits(settings: Settings) -> Race:
 
 
 def _hits_direct(settings: Settings) -> Race:
-    task = surfaces.task_of(settings, settings.image // 4, device="cuda")
+    task = task_of(settings, settings.image // 4, device="cuda")
 
     def cast(scheme: str) -> Callable[[], Any]:
-        surface = surfaces.surface_of(task, "triquadratic", scheme)
-        return lambda: tuple(x.nan_to_num(posinf=0) for x in surfaces.hits_and_normals(surface, task))
+        surface = surface_of(task, "triquadratic", scheme)
+        return lambda: tuple(x.nan_to_num(posinf=0) for x in hits_and_normals(surface, task.origins, task.directions))
 
     contestants = [_finished(scheme, cast(scheme), "hits", task.rays) for scheme in ("fused", "direct")]
     return Race(surfaces.described(task), contestants, [Ratio("fused", "direct")], tolerance=1e-2)
 
 
 def _hits_adjoint(settings: Settings) -> Race:
-    task = surfaces.task_of(settings, _IMAGE * settings.image, device="cuda")
+    task = task_of(settings, _IMAGE * settings.image, device="cuda")
     forward, both = surfaces.ways_of(task)
     contestants = [
         _finished("forward", forward, None, task.rays),

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item
+from benchmarks.level_sets import hits_and_normals
 from benchmarks.peers import embree_mesh
 from benchmarks.records import at_most
 from benchmarks.settings import Settings
@@ -36,13 +37,6 @@ def rays_of(surface: Slim, edge: int) -> Rays:
     origins, directions = PerspectiveCamera.framing(surface.domain, (0.3, 1.0, 0.6)).rays(edge, edge)
     origins, directions = (x.reshape(-1, 3).float().contiguous() for x in torch.broadcast_tensors(origins, directions))
     return origins, directions
-
-
-def hits_and_normals(surface: Slim, rays: Rays) -> tuple[Tensor, Tensor]:
-    hit = surface.hit(*rays)
-    normal = surface.at(*rays, hit).normal
-    assert normal is not None
-    return torch.where(hit.valid, hit.t, 0), normal
 
 
 def error(points: Tensor) -> float:
@@ -83,7 +77,7 @@ def _first(settings: Settings) -> Race:
     t = surface.hit(*(x.double() for x in rays)).t
     rms = error((rays[0].double() + t[:, None] * rays[1].double())[t < torch.inf])
     hits = Contestant("hits", lambda: surface.hit(*rays), samples=len(t))
-    contestants = [hits, Contestant("hits and normals", lambda: hits_and_normals(surface, rays), samples=len(t))]
+    contestants = [hits, Contestant("hits and normals", lambda: hits_and_normals(surface, *rays), samples=len(t))]
     what = f"a torus in {len(surface):,} balls, RMS error {rms:.1e}, {len(t):,} float32 rays"
     if why := embree_mesh.missing():
         return Race(f"{what}: first hits", contestants, absent={embree_mesh.NAME: why})
@@ -114,8 +108,8 @@ def _backward(settings: Settings) -> Race:
 
     def forward() -> Tensor:
         """A cover that is new in every call, as in a descent."""
-        t, normal = hits_and_normals(Slim(*given), rays)
-        return t.sum() + normal.sum()
+        t, normal = hits_and_normals(Slim(*given), *rays)
+        return t.nan_to_num(posinf=0).sum() + normal.sum()
 
     def alone() -> Any:
         with torch.no_grad():

@@ -9,10 +9,10 @@ from itertools import cycle
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from benchmarks.comparisons.scaling import thread_numbers
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, Tick, race_item, usable_cores
+from benchmarks.level_sets import LEVEL, hits_and_normals, surface_of, task_of
 from benchmarks.peers import casters, embree_mesh, isoray_bisection, mitsuba_sdfgrid, vtk_flying_edges, vtk_raycaster
 from benchmarks.peers.task import Casting
 from benchmarks.probe import measured
@@ -24,7 +24,6 @@ from filterlab.render.materials import Phong
 from filterlab.render.raycast import raycast
 from filterlab.surfaces import LevelSet
 
-_LEVEL = 0.5
 _LEVELS = (0.48, 0.49, 0.5, 0.51, 0.52)
 SEARCHED = tuple(name for name, method in METHODS.items() if method.facts.continuity >= 0)
 """Methods whose level sets are surfaces."""
@@ -45,35 +44,15 @@ _BISECTED = 32  # pixels along an edge of what isoray casts
 _PLAIN = 64  # pixels along an edge of what plain torch casts
 
 
-def task_of(settings: Settings, size: int | None = None, voxels: int | None = None, device: str = "cpu") -> Casting:
-    scene = marschner_lobb(voxels or settings.image_voxels, size or 2 * settings.image)
-    origins, directions = scene.camera.rays(scene.size, scene.size)
-    origins, directions = (x.expand(directions.shape).float() for x in (origins, directions))
-    volume, origins, directions = (x.contiguous().to(device) for x in (scene.volume, origins, directions))
-    return Casting(volume, _LEVEL, origins, directions, settings.threads)
-
-
 def described(task: Casting) -> str:
     n = task.volume.shape[-1]
     return f"Marschner-Lobb {n}³ float32, level {task.level:g}, {task.rays:,} rays"
 
 
-def surface_of(task: Casting, method: str, scheme: str = "fused") -> LevelSet:
-    gradient = "analytic" if method == "trilinear" else None
-    return LevelSet(reconstruct(task.volume, method, scheme=scheme, gradient=gradient), task.level)
-
-
-def hits_and_normals(surface: LevelSet, task: Casting) -> tuple[Tensor, Tensor]:
-    hit = surface.hit(task.origins, task.directions)
-    normal = surface.at(task.origins, task.directions, hit).normal
-    assert normal is not None
-    return hit.t, normal
-
-
 def _hits(task: Casting, method: str, scheme: str = "fused", name: str | None = None) -> Contestant:
     """First hits and normals."""
     surface = surface_of(task, method, scheme)
-    call = lambda: hits_and_normals(surface, task)  # noqa: E731
+    call = lambda: hits_and_normals(surface, task.origins, task.directions)  # noqa: E731
     computes = task.computes if method == "trilinear" else f"{method} hits"
     return Contestant(name or method, call, computes, lambda found: task.summary(found[0].numpy()), task.rays)
 
@@ -113,10 +92,10 @@ def _bisecting(settings: Settings) -> Race:
 def _renderers(settings: Settings) -> Race:
     """Lit images. On a CPU VTK has no other way to a level set than steps, of ½ voxel, through opacity that jumps."""
     n, size, steps = settings.image_voxels, 2 * settings.image, 512
-    above = torch.arange(steps) >= round(_LEVEL * (steps - 1))
+    above = torch.arange(steps) >= round(LEVEL * (steps - 1))
     table = torch.cat((torch.full((steps, 3), 0.8), above[:, None].float()), 1)
     scene = replace(marschner_lobb(n, size), table=table, threads=settings.threads)
-    surface = LevelSet(reconstruct(scene.volume, "trilinear", gradient="analytic"), _LEVEL)
+    surface = LevelSet(reconstruct(scene.volume, "trilinear", gradient="analytic"), LEVEL)
     draw = lambda: raycast(surface, scene.camera, Phong(), size=(size, size))  # noqa: E731
     contestants, ratios, absent = [Contestant("trilinear", draw, samples=size**2)], [], {}
     if why := vtk_raycaster.missing():
@@ -124,9 +103,7 @@ def _renderers(settings: Settings) -> Race:
     else:
         contestants.append(vtk_raycaster.marching(scene))
         ratios.append(Ratio("trilinear", vtk_raycaster.NAME))
-    return Race(
-        f"Marschner-Lobb {n}³ float32, level {_LEVEL:g}, lit images {size}²", contestants, ratios, absent=absent
-    )
+    return Race(f"Marschner-Lobb {n}³ float32, level {LEVEL:g}, lit images {size}²", contestants, ratios, absent=absent)
 
 
 def _new_level(settings: Settings) -> Race:
@@ -135,7 +112,7 @@ def _new_level(settings: Settings) -> Race:
     field = reconstruct(task.volume, "triquadratic")
     levels = cycle(_LEVELS)
 
-    call = lambda: hits_and_normals(LevelSet(field, next(levels)), task)  # noqa: E731
+    call = lambda: hits_and_normals(LevelSet(field, next(levels)), task.origins, task.directions)  # noqa: E731
     contestants, absent, bars = [Contestant("triquadratic", call, samples=task.rays)], {}, {embree_mesh: "1/3"}
     ratios = []
     for peer in (embree_mesh, vtk_flying_edges):
@@ -168,7 +145,7 @@ def ways_of(task: Casting) -> tuple[Callable[[], Any], Callable[[], Any]]:
 
     def forward() -> Any:
         surface = LevelSet(reconstruct(volume, "triquadratic"), task.level)
-        t, normal = hits_and_normals(surface, replace(task, origins=origins))
+        t, normal = hits_and_normals(surface, origins, task.directions)
         return torch.where(t < torch.inf, t, 0).sum() + normal.sum()
 
     def alone() -> Any:
