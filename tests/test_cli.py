@@ -77,7 +77,7 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_line_that_makes_no_sense(capsys: pytest.CaptureFixture[str], volume_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.nrrd"
-    known = "render, mesh, scene, sdf, resample, convert, recommend, methods, info"
+    known = "render, mesh, scene, terrain, sdf, slim, resample, convert, recommend, methods, info"
     fails(capsys, ["rendr"], 2, f"unknown command 'rendr'; did you mean 'render'? known commands: {known}")
     fails(capsys, ["resample", volume_file], 2, "--output")
     fails(capsys, ["resample", volume_file, "-o", out], 2, "one of --spacing, --shape and --like; got none")

@@ -32,6 +32,11 @@ WRITERS: dict[str, tuple[str, list[str], str]] = {
     "mesh": ("out.ply", ["{in}", "--level", "50"], r"\d+ triangles, \d+ vertices"),
     "render": ("out.png", ["{in}", "--level", "50", "--size", "8", "6"], "8 × 6 pixels, 8-bit RGB"),
     "slim": ("out.npz", ["{xyz}", "--tolerance", "0.01"], r"\d+ balls of 300 points, rms [\d.e-]+, worst [\d.e-]+"),
+    "terrain": (
+        "out.png",
+        ["{dem}", "--size", "8", "6", "--subpixels", "1"],
+        r"8 × 6 pixels, 8-bit RGB, [\d.]+ times as high as it is",
+    ),
     "recommend": ("out.yaml", ["{in}", "--max-error", "90%"], "a scene"),
 }
 """Command -> what it writes, its arguments, and what is said of the output."""
@@ -46,7 +51,8 @@ def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[
     save_volume(Volume(samples, spacing=(1, 2, 3), world=World(unit="mm")), path)
     assert main(["mesh", str(path), "--level", "50", "-q", "-o", str(ply)]) == 0
     np.savetxt(xyz := tmp_path / "in.xyz", sphere(300))
-    given = {"{in}": str(path), "{ply}": str(ply), "{xyz}": str(xyz)}
+    np.save(dem := tmp_path / "in.npy", np.linspace(0, 9, 63, dtype=np.float32).reshape(7, 9) ** 2)
+    given = {"{in}": str(path), "{ply}": str(ply), "{xyz}": str(xyz), "{dem}": str(dem)}
 
     def made(command: str, *more: str) -> list[str]:
         output, arguments, _ = WRITERS[command]

@@ -497,8 +497,9 @@ def test_directions_may_have_any_length():
 
 def test_surfaces_are_public():
     level_sets = {"Hits", "LevelSet", "Mesh", "Surface", "SurfacePoints", "mesh"}
-    quadrics = {"Bounds", "Planes", "Quadrics", "Spheres", "Tetrahedra"}
-    assert set(surfaces.__all__) == level_sets | quadrics
+    quadrics = {"BilinearQuads", "Bounds", "Planes", "Quadrics", "Spheres", "Tetrahedra", "molecular_skin"}
+    covers, terrains = {"Fit", "Slim", "fit_slim"}, {"HeightField", "Relief"}
+    assert set(surfaces.__all__) == level_sets | quadrics | covers | terrains
 
 
 def test_a_level_and_samples_that_change_in_place_are_seen() -> None:
