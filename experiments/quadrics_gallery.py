@@ -25,7 +25,6 @@ from experiments.config import ExperimentConfig
 from experiments.runs import Record, Run, Unit, timed
 from experiments.slim_error import LIFT, SHAPES, along_normals, unblended
 from filterlab.fields.base import Domain
-from filterlab.io.images import save_image
 from filterlab.render.camera import OrthographicCamera, PerspectiveCamera
 from filterlab.render.materials import Material, Phong, ReflectionLines, Toon
 from filterlab.render.raycast import raycast
@@ -80,9 +79,8 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
         lambda: raycast(surface, camera, material, size=config.size, lights=_LIGHTS, background=_BACKGROUND)
     )
     assert isinstance(made, Tensor)
-    file = f"{part}-{name}.png"
-    save_image(made[..., :3], run.folder / file)
-    return {"part": part, "name": name, "image": file, "seconds": seconds, **told}
+    saved = run.save_image(f"{part}-{name}", made[..., :3])
+    return {"part": part, "name": name, "image": saved, "files": [saved], "seconds": seconds, **told}
 
 
 Made = tuple[Surface, Material, "PerspectiveCamera | OrthographicCamera", Record]
