@@ -200,6 +200,7 @@ EXPECTED = {
     "sdf": {"measuring", "writing"},
     "mesh": {"reading", "meshing"},
     "slim": {"fitting"},
+    "terrain": {"reading", "rendering"},
     "render": {"reading", "rendering"},
     "recommend": {"reading", "errors", "costs"},
     "info": {"reading", "counting"},
