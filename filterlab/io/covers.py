@@ -16,7 +16,7 @@ from torch import Tensor
 
 from filterlab.io.atomic import atomic_write, check_writable
 from filterlab.io.bounded import VolumeFileError, regular_file
-from filterlab.io.numpy_files import names_of_arrays, read_arrays, write_arrays
+from filterlab.io.numpy_files import holds_array, read_arrays, write_arrays
 from filterlab.surfaces.slim import FACES, Slim
 
 SUFFIX = ".npz"
@@ -65,8 +65,7 @@ def save_slim(slim: Slim, path: str | os.PathLike[str]) -> None:
 
 def is_slim(path: str | os.PathLike[str]) -> bool:
     """Whether an .npz file says that it holds a cover. Raises VolumeFileError: it is damaged."""
-    path = Path(path)
-    return path.suffix.lower() == SUFFIX and path.is_file() and "slim" in names_of_arrays(path)
+    return holds_array(path, "slim")
 
 
 def load_slim(path: str | os.PathLike[str]) -> Slim:

@@ -297,10 +297,13 @@ def read_arrays(path: Path, shapes: Mapping[str, tuple[int | None, ...]]) -> dic
         return {name: _numbers(path, archive, info, shapes[name]) for name, info in own.items()}
 
 
-def names_of_arrays(path: Path) -> frozenset[str]:
-    """Of an .npz file. Raises VolumeFileError."""
+def holds_array(path: str | os.PathLike[str], name: str) -> bool:
+    """Whether that is an .npz file with an array of that name. Raises VolumeFileError: it is damaged."""
+    path = Path(path)
+    if path.suffix.lower() != ".npz" or not path.is_file():
+        return False
     with open_archive(path) as (_, members):
-        return frozenset(members)
+        return name in members
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from filterlab.io.atomic import atomic_write, check_writable
 from filterlab.io.bounded import VolumeFileError, regular_file
-from filterlab.io.numpy_files import names_of_arrays, read_arrays, write_arrays
+from filterlab.io.numpy_files import holds_array, read_arrays, write_arrays
 from filterlab.ops.quadrics import FACES
 from filterlab.ops.tree import Boxes
 from filterlab.surfaces.bounds import Bounds, check_positive, check_rows
@@ -63,8 +63,7 @@ def save_quadrics(quadrics: Quadrics, path: str | os.PathLike[str]) -> None:
 
 def is_quadrics(path: str | os.PathLike[str]) -> bool:
     """Whether an .npz file says that it holds quadrics. Raises VolumeFileError: it is damaged."""
-    path = Path(path)
-    return path.suffix.lower() == SUFFIX and path.is_file() and "quadrics" in names_of_arrays(path)
+    return holds_array(path, "quadrics")
 
 
 def load_quadrics(path: str | os.PathLike[str]) -> Quadrics:
