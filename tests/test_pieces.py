@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from filterlab.methods import from_kernel
 from filterlab.ops.raycast import marks_of, marks_of_bits
 from filterlab.ops.reference import bounds as hulls
 from tests import oracles
+from tests.pairs import covering
 from tests.test_methods import CONTINUOUS, TENSOR_PRODUCTS
 
 BOUNDARIES = [str(b) for b in fl.Boundary]
@@ -116,8 +118,13 @@ def test_pieces_of_a_kernel_that_is_a_tensor():
     assert torch.equal(pieces.coefficients[1:][pieces.joined[1:], 0], pieces.coefficients[:-1][pieces.joined[1:], -1])
 
 
-@pytest.mark.parametrize("storage", ["float16", "bfloat16", "float32", "int16", "uint8"])
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize(
+    ("method", "storage"),
+    covering(
+        product(TENSOR_PRODUCTS, ("float16", "bfloat16", "float32", "int16", "uint8")),
+        lambda method, storage: (method, storage, (method == "ncrsi", storage)),
+    ),
+)
 def test_storage(method, storage):
     field = fl.reconstruct(100 + 7 * samples(4, 5, 6), method, storage=storage)
     origins, directions = rays(field)
