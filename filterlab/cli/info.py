@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from filterlab.cli.loading import reading
 from filterlab.cli.options import Channel, Frame
-from filterlab.cli.terminal import progress_bar, show, tell
+from filterlab.cli.terminal import progress_bar, tell
 from filterlab.world import RAS, World
 
 if TYPE_CHECKING:
@@ -84,13 +84,9 @@ class Info:
 
 
 def _show_lines(lines: Sequence[tuple[str, str]]) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(show_header=False, box=None)
+    width = max(len(name) for name, _ in lines)
     for name, value in lines:
-        table.add_row(name, Text(value))
-    show(table)
+        print(f" {name:<{width}}  {value}".rstrip())
 
 
 def _described_heights(header: HeightsHeader) -> list[tuple[str, str]]:

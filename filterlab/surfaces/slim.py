@@ -25,13 +25,14 @@ too. They are not where cuts end a quadric, or where another sheet comes first.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array
 from filterlab.fields.base import Domain
 from filterlab.ops.differentiable import slim as ops
 from filterlab.ops.reference.slim import weight
@@ -74,6 +75,9 @@ class Slim(Surface):
     in_pieces = True
     fit: Fit | None = None
     """How well it fits the points it was made for (`fit_slim`); None: it was made of numbers."""
+    of_points: Callable[[Array], tuple[Tensor, ...]] | None = None
+    """Its tensors when its fits are to other points than those it was made for (`fit_slim`); None: it was made of
+    numbers."""
 
     def __init__(
         self,
@@ -120,6 +124,31 @@ class Slim(Surface):
         other = copy.copy(self)
         other.centers, other.radii, other.A, other.b, other.c = tensors
         other._built = None
+        return other
+
+    def refitted(self, points: Array) -> Slim:
+        """The cover of `fit_slim` with its local fits solved again for points that have moved.
+
+        Every graph is again the weighted least-squares fit to its own points, z = h(u, v), weights w(|x − p| / r).
+        Held are balls, offset and cuts, which points belong to which graph, and the planes that graphs stand on, so
+        that for the points of the fit this is the same cover, and near them a smooth function of them.
+
+        Args:
+            points: (N, 3), as many as were fitted and in their order, float32 or float64. Of those that were left out,
+                duplicates and strays, nothing depends.
+
+        Returns:
+            a `Slim` in float64 on the CPU, with `fit` None. A, b and c are differentiable in the points, twice: so are
+            hits, depths, normals. Memory for that is bounded: fits are solved again in backward passes, part by part.
+
+        Raises:
+            TypeError: no such points. ValueError: another number of them, or not finite; a cover that was not fitted to
+                points, as one that a file holds.
+        """
+        if self.of_points is None:
+            raise ValueError("only covers made by fit_slim know their points; this one was made of numbers")
+        other = self.with_tensors(self.of_points(points))
+        other.fit = None
         return other
 
     @property
