@@ -204,10 +204,11 @@ def tiny(name, scan):
                     "title": "a ridge",
                     "heights": str(ridge(scan.with_name("ridge.npz"))),
                     "views": [
-                        {"title": "as it is", "scene": {"size": [12, 8], "subpixels": 1}},
+                        {"title": "as it is", "size": [12, 8], "terrain": {"subpixels": 1}},
                         {
                             "title": "a flight",
-                            "scene": {"size": [12, 8], "subpixels": 1, "haze": 500},
+                            "size": [12, 8],
+                            "terrain": {"subpixels": 1, "haze": 500},
                             "flight": {"points": [[5, 30, 20], [40, 35, 20]]},
                             "frames": 2,
                         },
