@@ -114,11 +114,13 @@ class Surface(ABC):
         domain: the box that the surface lies in.
         max_order: of derivatives of F: 2 where curvatures can be given.
         in_pieces: whether F is another one for every piece: then hits tell theirs.
+        tells_ends: whether `ends` is known of the pieces, as edges of images need.
     """
 
     domain: Domain
     max_order: int
     in_pieces: bool = False
+    tells_ends: bool = False
 
     @property
     def device(self) -> torch.device | None:
@@ -128,6 +130,11 @@ class Surface(ABC):
     @abstractmethod
     def jet(self, points: Tensor, order: int, piece: Tensor | None = None) -> tuple[Tensor, ...]:
         """F, and its gradient and Hessian up to an order, at world points (..., 3); of a piece for each, (...)."""
+
+    def ends(self, points: Tensor, piece: Tensor) -> Tensor:
+        """What no point of a piece has above 0: distances (..., K) of world points (..., 3) from what bounds theirs,
+        (...), negative within; differentiable as hits are."""
+        raise TypeError(f"{type(self).__name__} cannot tell where its pieces end")
 
     @property
     @abstractmethod
