@@ -15,7 +15,6 @@ is 0, at tangents, a hit has no derivative, and gets 0. The same where it is not
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, all_finite, as_tensor
 from filterlab.fields.base import Domain, check_order, type_of_rays
 from filterlab.ops.differentiable import hit_points
 from filterlab.ops.differentiable.recording import plain, transforming
@@ -418,7 +417,7 @@ def check_rays(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     origins, directions = as_tensor(origins), as_tensor(directions)
     rays = _broadcast(origins, directions)
     for name, x in (("origins", origins), ("directions", directions)):
-        if not all_finite(x.detach()):
+        if not all_finite(x):
             wrong = int((~x.detach().isfinite()).any(-1).sum())
             raise ValueError(f"{name} must be finite; {wrong} rays are not")
     some_zero = int(directions.detach().count_nonzero()) < directions.numel()
@@ -445,11 +444,6 @@ def _broadcast(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
             f"got {tuple(origins.shape)} and {tuple(directions.shape)}"
         ) from None
     return o, d
-
-
-def all_finite(x: Tensor) -> bool:
-    """Whether all numbers are: a finite sum has finite terms; finite terms may have another one."""
-    return math.isfinite(float(x.sum())) or bool(x.isfinite().all())
 
 
 def _where(mask: Tensor) -> Tensor:
