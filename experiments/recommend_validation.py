@@ -44,7 +44,7 @@ HALVES = ("tuning", "reporting")
 
 _BUDGETS = 1e-4, 0.1
 _AROUND = 4.0  # times the true errors
-_COUNTS, _HELD = 0.05, 0.97  # see `filterlab.recommendation.calibration`
+_COUNTS, _HELD, _LIKELY = 0.05, 0.97, 0.85  # see `filterlab.recommendation.calibration`
 _COSTS_ON = 64  # voxels along an axis
 
 
@@ -276,8 +276,8 @@ def judged(answer: Recommendation, true: Callable[[Candidate], float]) -> dict[s
 # --- calibration ------------------------------------------------------------------------------------------------------
 
 
-def fitted(records: Sequence[Record]) -> dict[str, tuple[list[float], list[float]]]:
-    """c and C of `filterlab.recommendation.calibration`, from the records of the tuning half."""
+def fitted(records: Sequence[Record]) -> dict[str, tuple[list[float], ...]]:
+    """c, C and L of `filterlab.recommendation.calibration`, from the records of the tuning half."""
     tuning = [r for r in records if r["half"] == HALVES[0]]
     return {quantity: _quantiles(_needed(tuning, quantity)) for quantity in CALIBRATION}
 
@@ -304,13 +304,11 @@ def _pairs(found: Mapping[str, Any], quantity: str) -> list[list[Any]]:
     return [way[quantity] for way in found["ways"] if way["storage"] is None]
 
 
-def _quantiles(rows: np.ndarray) -> tuple[list[float], list[float]]:
+def _quantiles(rows: np.ndarray) -> tuple[list[float], ...]:
     """At each of `FALLS`, over what lies between its neighbours; infinite where nothing does."""
     ends = (-math.inf, *FALLS, math.inf)
-    factors: tuple[list[float], list[float]] = ([], [])
-    for i in range(1, len(ends) - 1):
-        near = rows[(rows[:, 0] >= ends[i - 1]) & (rows[:, 0] <= ends[i + 1])]
-        for column, known in enumerate(factors):
-            found = float(np.quantile(near[:, column + 1], _HELD)) if len(near) else math.inf
-            known.append(found)
-    return factors
+    near = [rows[(rows[:, 0] >= low) & (rows[:, 0] <= high), 1:] for low, high in zip(ends[:-2], ends[2:], strict=True)]
+    return tuple(
+        [float(np.quantile(found[:, column], part)) if len(found) else math.inf for found in near]
+        for column, part in ((0, _HELD), (1, _HELD), (1, _LIKELY))
+    )

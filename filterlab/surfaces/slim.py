@@ -25,19 +25,21 @@ too. They are not where cuts end a quadric, or where another sheet comes first.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from filterlab.arrays import Array
 from filterlab.fields.base import Domain
 from filterlab.ops.differentiable import slim as ops
+from filterlab.ops.reference.hit_points import length
 from filterlab.ops.reference.slim import weight
 from filterlab.ops.slim import Cover, Members
-from filterlab.surfaces.base import Hits, Surface, SurfacePoints, geometry, length
-from filterlab.surfaces.bounds import Spheres, check_rows
+from filterlab.surfaces.base import Hits, Surface, SurfacePoints, geometry
+from filterlab.surfaces.bounds import Spheres, check_rows, plane_distances
 from filterlab.surfaces.quadrics import Quadrics
 
 _T, _ENDS, _NORMAL = 0, slice(1, 3), slice(3, 6)  # of `Hits.blend`: t, begin and end (`ops.slim`), Σ w n
@@ -72,8 +74,12 @@ class Slim(Surface):
 
     max_order = 2
     in_pieces = True
+    tells_ends = True
     fit: Fit | None = None
     """How well it fits the points it was made for (`fit_slim`); None: it was made of numbers."""
+    of_points: Callable[[Array], tuple[Tensor, ...]] | None = None
+    """Its tensors when its fits are to other points than those it was made for (`fit_slim`); None: it was made of
+    numbers."""
 
     def __init__(
         self,
@@ -112,6 +118,12 @@ class Slim(Surface):
         """F, 2 (A y + b) and 2 A of the quadrics numbered by `piece` (...), each for itself."""
         return self._local.jet(points, order, piece)
 
+    def ends(self, points: Tensor, piece: Tensor) -> Tensor:
+        """Distances (..., 1 + K) from balls, as they are now, and cuts of the quadrics numbered by `piece` (...)."""
+        bounds = self._now().local.bounds
+        off = (points.double() - self.centers[piece].double()).norm(dim=-1) - self.radii[piece].double()
+        return torch.cat((off[..., None], plane_distances(points.double(), bounds.planes[piece])), -1)
+
     @property
     def tensors(self) -> tuple[Tensor, ...]:
         return self.centers, self.radii, self.A, self.b, self.c
@@ -120,6 +132,31 @@ class Slim(Surface):
         other = copy.copy(self)
         other.centers, other.radii, other.A, other.b, other.c = tensors
         other._built = None
+        return other
+
+    def refitted(self, points: Array) -> Slim:
+        """The cover of `fit_slim` with its local fits solved again for points that have moved.
+
+        Every graph is again the weighted least-squares fit to its own points, z = h(u, v), weights w(|x − p| / r).
+        Held are balls, offset and cuts, which points belong to which graph, and the planes that graphs stand on, so
+        that for the points of the fit this is the same cover, and near them a smooth function of them.
+
+        Args:
+            points: (N, 3), as many as were fitted and in their order, float32 or float64. Of those that were left out,
+                duplicates and strays, nothing depends.
+
+        Returns:
+            a `Slim` in float64 on the CPU, with `fit` None. A, b and c are differentiable in the points, twice: so are
+            hits, depths, normals. Memory for that is bounded: fits are solved again in backward passes, part by part.
+
+        Raises:
+            TypeError: no such points. ValueError: another number of them, or not finite; a cover that was not fitted to
+                points, as one that a file holds.
+        """
+        if self.of_points is None:
+            raise ValueError("only covers made by fit_slim know their points; this one was made of numbers")
+        other = self.with_tensors(self.of_points(points))
+        other.fit = None
         return other
 
     @property
@@ -190,6 +227,9 @@ class Slim(Surface):
         t = hit.blend[:, _T] + (t - t.detach())  # it keeps its bits
         blend = torch.cat((t[:, None], hit.blend[:, _ENDS], sums[:, 2:]), 1)
         return replace(hit, t=t.to(hit.t.dtype), blend=blend)
+
+    def _is_plain(self, origins: Tensor, directions: Tensor, hit: Hits) -> bool:
+        return False  # gradients at hits are blended
 
     def _known(self, origins: Tensor, directions: Tensor, hit: Hits, order: int) -> SurfacePoints:
         """The point is on the ray; gradient and Hessian are means of unit normals and of H / |∇F|."""

@@ -66,6 +66,7 @@ class Cover:
         least_radius: (N,) of a ball around each point.
         weight, off: (N,) sums of weights, and of weights times distances.
         graphs, cuts: of the balls that were kept, part by part.
+        counts, members: how many points each graph was fitted to, (m,), and their numbers, graph after graph.
         sharp, smallest: numbers of balls that share an edge, and of those kept whatever their misfit.
     """
 
@@ -77,6 +78,8 @@ class Cover:
     off: Tensor
     graphs: list[Graphs] = field(default_factory=list)
     cuts: list[Tensor] = field(default_factory=list)
+    counts: list[Tensor] = field(default_factory=list)
+    members: list[Tensor] = field(default_factory=list)
     sharp: int = 0
     smallest: int = 0
 
@@ -144,6 +147,8 @@ class Cover:
         self.off.index_add_(0, point, w * fits.off[own])
         self.graphs.append(fits.graphs[kept])
         self.cuts.append(fits.cuts[kept])
+        self.counts.append(torch.bincount(fits.pairs.ball[own], minlength=len(kept))[kept])
+        self.members.append(point[fits.pairs.ball[own].argsort(stable=True)])
 
 
 class Tried(NamedTuple):

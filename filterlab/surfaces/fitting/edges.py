@@ -54,14 +54,15 @@ def edges_in(
     """Two graphs in every ball, and the plane between, which is found from sides (P,) of points, 0 or 1."""
     count = len(centers)
     own = pairs._replace(ball=2 * pairs.ball + side)
-    for _ in range(_ROUNDS):
+    for turn in range(_ROUNDS):
         graphs = _halves(points, normals, own, centers, radii, order)
         place, both = _edge(graphs)
         across = unit(both[:, 0] - both[:, 1])
         y = (points[pairs.point] - centers[pairs.ball]) / radii[pairs.ball, None]
         height = (across[pairs.ball] * (y - place[pairs.ball])).sum(-1)
         turned = _turned(height, own.ball, count)
-        own = own._replace(ball=2 * pairs.ball + (height * turned[pairs.ball] < 0).long())
+        if turn < _ROUNDS - 1:
+            own = own._replace(ball=2 * pairs.ball + (height * turned[pairs.ball] < 0).long())
     across = across * turned[:, None]
     plane = torch.cat((-across, (across * place).sum(-1, keepdim=True)), 1)
     valid = ((both[:, 0] * both[:, 1]).sum(-1) < _SHARP) & (place.norm(dim=-1) < 1)

@@ -12,6 +12,7 @@ from filterlab.arrays import Array, as_tensor
 from filterlab.surfaces.bounds import check_rows
 from filterlab.surfaces.fitting.covering import Cover
 from filterlab.surfaces.fitting.graphs import Graphs
+from filterlab.surfaces.fitting.refitting import Members
 from filterlab.surfaces.fitting.scans import NEIGHBORS, scan_of
 from filterlab.surfaces.slim import Fit, Slim
 
@@ -48,7 +49,8 @@ def fit_slim(
 
     Returns:
         a `Slim` in float64 on the CPU, whose `fit` tells how well it fits. Holes stay open where they are wider than
-        some spacings of points. Not differentiable in the points.
+        some spacings of points. Where derivatives are asked by the points it has them, as `Slim.refitted` says; by
+        normals there are none.
 
     Raises:
         TypeError: no such tensors. ValueError: other shapes; numbers that are not finite; fewer than `least` distinct
@@ -71,18 +73,22 @@ def fit_slim(
     if len(on) < least:
         raise ValueError(f"expected points close to others; of {len(own)} all but {len(on)} are strays")
     cover = Cover.of(scan, tolerance, least, order, lambda part: told(_SCAN + (1 - _SCAN) * part))
-    slim = _slim(cover, middle, diagonal)
-    slim.fit = _told(cover, len(given) - len(own), len(own) - len(on), diagonal)
+    graphs, numbers = Graphs(*(torch.cat(rows) for rows in zip(*cover.graphs, strict=True))), kept[on].int()
+    counts, point = torch.cat(cover.counts), numbers[torch.cat(cover.members)]
+    slim = _slim(Members(len(given), middle, diagonal, graphs, counts, point, order), torch.cat(cover.cuts))
+    fit = _told(cover, len(given) - len(own), len(own) - len(on), diagonal)
+    if isinstance(points, Tensor) and points.requires_grad and torch.is_grad_enabled():
+        slim = slim.refitted(points)
+    slim.fit = fit
     return slim
 
 
-def _slim(cover: Cover, middle: Tensor, diagonal: float) -> Slim:
+def _slim(members: Members, cuts: Tensor) -> Slim:
     """In the world."""
-    graphs = Graphs(*(torch.cat(rows) for rows in zip(*cover.graphs, strict=True)))
-    cuts = torch.cat(cover.cuts)
-    centers, radii = middle + diagonal * graphs.centers, diagonal * graphs.radii
-    A, b, c = graphs._replace(centers=centers, radii=radii).quadrics()
-    return Slim(centers, radii, A, b, c, cuts=_in_world(cuts, centers, radii))
+    centers, radii, *numbers = members.in_world(members.graphs.coefficients)
+    slim = Slim(centers, radii, *numbers, cuts=_in_world(cuts, centers, radii))
+    slim.of_points = members.refitted
+    return slim
 
 
 def _in_world(cuts: Tensor, centers: Tensor, radii: Tensor) -> Tensor | None:
