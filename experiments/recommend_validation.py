@@ -36,6 +36,7 @@ from filterlab.recommendation.calibration import CALIBRATION, FALLS
 from filterlab.recommendation.choice import TASKS, Candidate, Question, Recommendation, choose, errors_of
 from filterlab.recommendation.errors import SURE, MethodErrors, Yardstick
 from filterlab.recommendation.ways import Way, WayCost, costs_of, ways_of
+from filterlab.scenes.model import MethodName
 from filterlab.volume import Boundary, as_volume
 
 Size = Annotated[int, Field(ge=2, le=160)]
@@ -56,6 +57,7 @@ class Config(ExperimentConfig):
         sizes: voxels along an axis, least and most, log-uniform; large: those of one volume in `every`.
         scans, pieces: files, and pieces of every one; one in three is not low-passed before it is decimated.
         boundaries, budgets: how many of the five are drawn for a volume, and of budgets for each task.
+        methods: among which it chooses; left out, all.
         points: at which errors are computed.
         seconds: for which costs are measured, once.
     """
@@ -70,6 +72,7 @@ class Config(ExperimentConfig):
     pieces: Annotated[int, Field(ge=1, le=100)] = 6
     boundaries: Annotated[int, Field(ge=1, le=5)] = 2
     budgets: Annotated[int, Field(ge=2, le=20, multiple_of=2)] = 4
+    methods: Annotated[list[MethodName], Field(min_length=2, default_factory=lambda: list(METHODS))]
     points: Annotated[int, Field(ge=100, le=10**6)] = 2**14
     seconds: Annotated[float, Field(gt=0, le=600)] = 20.0
 
@@ -125,7 +128,7 @@ def _subject(config: Config, name: str, k: int, random: np.random.Generator, run
 def _costs(config: Config) -> dict[tuple[Way, int], WayCost]:
     """Of all ways, for jets of order 0 and 1, measured on one volume."""
     volume = fl.signals.marschner_lobb().sample(_COSTS_ON, dtype=torch.float32)
-    ways = [way for method in METHODS.values() for way in ways_of(method, torch.float32, True)]
+    ways = [way for name in config.methods for way in ways_of(METHODS[name], torch.float32, True)]
     return {
         (way, order): cost
         for order in (0, 1)
@@ -181,7 +184,7 @@ def _judged(
 ) -> dict[str, Any]:
     """Estimates and answers under a boundary."""
     yardstick = Yardstick.of(subject.volume[None], None, boundary, config.seed)
-    errors = errors_of(yardstick, list(METHODS), subject.volume.dtype, lambda _: True)
+    errors = errors_of(yardstick, config.methods, subject.volume.dtype, lambda _: True)
     known: dict[tuple[str, str | None], Truth] = {}
     for way in errors:
         if (way[0], way[2]) not in known:  # schemes compute the same field

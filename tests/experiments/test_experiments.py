@@ -173,6 +173,7 @@ def tiny(name, scan):
         "pieces": 3,
         "boundaries": 1,
         "budgets": 2,
+        "methods": ["trilinear", "triquadratic"],
         "points": 200,
         "seconds": 0.01,
     }
