@@ -17,6 +17,7 @@ import torch
 from filterlab import METHODS, Volume, load_volume, resample, save_volume, signals
 from filterlab.cli import main
 from filterlab.cli.terminal import progress_bar
+from filterlab.recommendation import recommend
 from filterlab.world import World
 from tests.test_fitting import sphere
 
@@ -44,7 +45,8 @@ WRITERS: dict[str, tuple[str, list[str], str]] = {
 
 @pytest.fixture
 def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
-    """The command line of a command that writes. Of all methods `recommend` would measure each."""
+    """The command line of a command that writes. Of all methods `recommend` would measure each, for a while."""
+    monkeypatch.setitem(recommend.__kwdefaults__, "seconds", 0.02)
     monkeypatch.setattr("filterlab.recommendation.choice.METHODS", {"trilinear": METHODS["trilinear"]})
     samples = (100 * signals.marschner_lobb().sample((5, 4, 3)).samples).float()
     path, ply = tmp_path / "in.nii", tmp_path / "in.ply"
