@@ -101,9 +101,13 @@ def loads_config(
     return _validated(document, model, Path())
 
 
-def dump_config(config: BaseModel) -> str:
-    """A YAML text that `load_config` reads back to an equal model. Raises ValueError on numbers that are not finite."""
-    return dump_data(config.model_dump(mode="json"))
+def dump_config(config: BaseModel, *, brief: bool = False) -> str:
+    """A YAML text that `load_config` reads back to an equal model. Raises ValueError on numbers that are not finite.
+
+    Args:
+        brief: leave out what nobody said.
+    """
+    return dump_data(config.model_dump(mode="json", exclude_unset=brief))
 
 
 def dump_data(data: Any) -> str:

@@ -204,10 +204,11 @@ def tiny(name, scan):
                     "title": "a ridge",
                     "heights": str(ridge(scan.with_name("ridge.npz"))),
                     "views": [
-                        {"title": "as it is", "scene": {"size": [12, 8], "subpixels": 1}},
+                        {"title": "as it is", "size": [12, 8], "terrain": {"subpixels": 1}},
                         {
                             "title": "a flight",
-                            "scene": {"size": [12, 8], "subpixels": 1, "haze": 500},
+                            "size": [12, 8],
+                            "terrain": {"subpixels": 1, "haze": 500},
                             "flight": {"points": [[5, 30, 20], [40, 35, 20]]},
                             "frames": 2,
                         },
@@ -345,6 +346,8 @@ def tiny(name, scan):
     configs["inverse_slim"] = {
         "target_balls": 100,
         "balls": 60,
+        "unknowns": ["numbers", "points"],
+        "points": 150,
         "views": {"training": 2, "held_out": 1, "size": 6, "shown": 8, "at_once": 1},
         "descent": {"iterations": 2, "learning_rate": 0.01},
     }
