@@ -17,7 +17,8 @@ from filterlab.fields import ranges as bounds
 from filterlab.kernels import KERNELS
 from filterlab.methods import from_kernel
 from filterlab.ops.differentiable.bounds import bits_of_blocks
-from filterlab.ops.raycast import marks_of, marks_of_bits
+from filterlab.ops.differentiable.raycast import marks_of_bits
+from filterlab.ops.raycast import marks_of
 from filterlab.ops.reference import bounds as hulls
 from tests import oracles
 from tests.pairs import covering
@@ -295,7 +296,7 @@ def test_marks_are_those_of_parts_one_by_one(shape, implementation, monkeypatch)
     assert torch.equal(blocks.in_order(blocks.low, shape), low)
     holds = (low <= 1510) & (high >= 1500)
     assert torch.equal(blocks.straddling(1500, 1510), holds)
-    marks = marks_of_bits(blocks.bits(1500, 1510))
+    marks = marks_of_bits(blocks.bits(1500, 1510), implementation)
     assert torch.equal(marks_of(holds), marks)
     whole = np.zeros([2 * -(-n // 2) for n in shape], dtype=bool)
     whole[tuple(slice(n) for n in shape)] = holds.numpy()

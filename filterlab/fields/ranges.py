@@ -19,8 +19,8 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from filterlab.ops.bounds import Codes
 from filterlab.ops.differentiable.bounds import bits_of_blocks, bounds
+from filterlab.ops.differentiable.raycast import marks_of_bits
 from filterlab.ops.pieces import Lattice
-from filterlab.ops.raycast import marks_of_bits
 from filterlab.ops.reference.bounds import layers_of, straddle, weights_of
 from filterlab.ops.tetrahedra import AnyLattice, TetrahedralLattice
 
