@@ -15,7 +15,6 @@ is 0, at tangents, a hit has no derivative, and gets 0. The same where it is not
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, all_finite, as_tensor
 from filterlab.fields.base import Domain, check_order, type_of_rays
 from filterlab.ops.differentiable import hit_points
 from filterlab.ops.differentiable.recording import plain, transforming
@@ -114,11 +113,13 @@ class Surface(ABC):
         domain: the box that the surface lies in.
         max_order: of derivatives of F: 2 where curvatures can be given.
         in_pieces: whether F is another one for every piece: then hits tell theirs.
+        tells_ends: whether `ends` is known of the pieces, as edges of images need.
     """
 
     domain: Domain
     max_order: int
     in_pieces: bool = False
+    tells_ends: bool = False
 
     @property
     def device(self) -> torch.device | None:
@@ -128,6 +129,11 @@ class Surface(ABC):
     @abstractmethod
     def jet(self, points: Tensor, order: int, piece: Tensor | None = None) -> tuple[Tensor, ...]:
         """F, and its gradient and Hessian up to an order, at world points (..., 3); of a piece for each, (...)."""
+
+    def ends(self, points: Tensor, piece: Tensor) -> Tensor:
+        """What no point of a piece has above 0: distances (..., K) of world points (..., 3) from what bounds theirs,
+        (...), negative within; differentiable as hits are."""
+        raise TypeError(f"{type(self).__name__} cannot tell where its pieces end")
 
     @property
     @abstractmethod
@@ -411,7 +417,7 @@ def check_rays(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     origins, directions = as_tensor(origins), as_tensor(directions)
     rays = _broadcast(origins, directions)
     for name, x in (("origins", origins), ("directions", directions)):
-        if not all_finite(x.detach()):
+        if not all_finite(x):
             wrong = int((~x.detach().isfinite()).any(-1).sum())
             raise ValueError(f"{name} must be finite; {wrong} rays are not")
     some_zero = int(directions.detach().count_nonzero()) < directions.numel()
@@ -438,11 +444,6 @@ def _broadcast(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
             f"got {tuple(origins.shape)} and {tuple(directions.shape)}"
         ) from None
     return o, d
-
-
-def all_finite(x: Tensor) -> bool:
-    """Whether all numbers are: a finite sum has finite terms; finite terms may have another one."""
-    return math.isfinite(float(x.sum())) or bool(x.isfinite().all())
 
 
 def _where(mask: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ from filterlab.ops.reference.hit_points import length
 from filterlab.ops.reference.slim import weight
 from filterlab.ops.slim import Cover, Members
 from filterlab.surfaces.base import Hits, Surface, SurfacePoints, geometry
-from filterlab.surfaces.bounds import Spheres, check_rows
+from filterlab.surfaces.bounds import Spheres, check_rows, plane_distances
 from filterlab.surfaces.quadrics import Quadrics
 
 _T, _ENDS, _NORMAL = 0, slice(1, 3), slice(3, 6)  # of `Hits.blend`: t, begin and end (`ops.slim`), Σ w n
@@ -74,6 +74,7 @@ class Slim(Surface):
 
     max_order = 2
     in_pieces = True
+    tells_ends = True
     fit: Fit | None = None
     """How well it fits the points it was made for (`fit_slim`); None: it was made of numbers."""
     of_points: Callable[[Array], tuple[Tensor, ...]] | None = None
@@ -116,6 +117,12 @@ class Slim(Surface):
     def jet(self, points: Tensor, order: int, piece: Tensor | None = None) -> tuple[Tensor, ...]:
         """F, 2 (A y + b) and 2 A of the quadrics numbered by `piece` (...), each for itself."""
         return self._local.jet(points, order, piece)
+
+    def ends(self, points: Tensor, piece: Tensor) -> Tensor:
+        """Distances (..., 1 + K) from balls, as they are now, and cuts of the quadrics numbered by `piece` (...)."""
+        bounds = self._now().local.bounds
+        off = (points.double() - self.centers[piece].double()).norm(dim=-1) - self.radii[piece].double()
+        return torch.cat((off[..., None], plane_distances(points.double(), bounds.planes[piece])), -1)
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
