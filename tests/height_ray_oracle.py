@@ -271,4 +271,4 @@ def _bisected(c: np.ndarray, sign: np.ndarray) -> np.ndarray:
 def _in_rows(own: np.ndarray, rays: int) -> tuple[np.ndarray, int]:
     """Which crossing of its ray each is, of rays in order, and how many there are at most, 1 at least."""
     count = np.bincount(own, minlength=rays)
-    return np.arange(len(own)) - (np.cumsum(count) - count)[own], max(count.max(initial=0), 1)
+    return np.arange(len(own)) - (np.cumsum(count) - count)[own], max(int(count.max(initial=0)), 1)
