@@ -1,15 +1,18 @@
-"""Can a rough cover be refined by what images show? Places, radii and quadrics by descent through blended hits.
+"""Can a rough cover be refined by what images show? By descent through blended hits, and edges.
 
-The target is a torus, as a fine cover; the start a coarse one of flat discs, off by noise in place, size and direction.
-Depths and normals are compared where both are hit: hits move smoothly with all numbers of a cover, also while balls
-begin and cease to have a part in them. At the outlines of what is seen derivatives of hits say nothing.
+The target is a torus, as a fine cover. What is recovered is one of two: all numbers of a cover, which starts as coarse
+flat discs, off by noise in place, size and direction; or the points that a cover was fitted to, off by noise, whose
+local fits are solved again at every step. Depths and normals are compared where both are hit: hits move smoothly with
+all numbers of a cover, also while balls begin and cease to have a part in them. Where masks are compared, derivatives
+are also those of what edges sweep over (`raycast(silhouettes=…)`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -21,8 +24,8 @@ from experiments.descent import Parameters, Stage, minimize
 from experiments.inverse_dvr import files
 from experiments.inverse_surface import Images, Views, Weights, compared, course, images_of, misfit, save_views
 from experiments.runs import Record, Run, Unit
-from filterlab.render import Camera
-from filterlab.surfaces import Slim
+from filterlab.render import Camera, Silhouettes
+from filterlab.surfaces import Slim, fit_slim
 
 _SECONDS = 1e-4  # of a pixel that a step looks at; only expectations use it
 
@@ -32,10 +35,14 @@ class Config(ExperimentConfig):
 
     Attributes:
         target_balls, balls: of the target's cover and the one that is refined, about.
-        noise: of the start: of a ball's radius, of places; and radians, of normals.
+        noise: of the start: of a ball's radius, of places; and radians, of normals. Of points: of their distance.
         offset: of both covers.
-        weights: of what is compared, by name: a recovery each. Masks have no derivatives here.
-        keeping: λ of the penalty λ mean (log r / r₀)², r₀ the radii of the start.
+        unknowns: what is recovered.
+        points: that a cover is fitted to, with this tolerance and at least so many in a ball.
+        weights: of what is compared, by name: a recovery each, of each of the unknowns.
+        lines, parts: of silhouettes, which there are where masks are compared.
+        keeping: λ of the penalty λ mean (log r / r₀)², r₀ the radii of the start; of points λ mean |x − x₀|² / their
+            distance².
         record_every, checkpoint_every: steps.
     """
 
@@ -44,48 +51,43 @@ class Config(ExperimentConfig):
     balls: Annotated[int, Field(ge=50, le=10**6)] = 400
     noise: Annotated[float, Field(ge=0, le=1)] = 0.2
     offset: Annotated[float, Field(ge=0)] = 0.5
+    unknowns: Annotated[list[Literal["numbers", "points"]], Field(min_length=1)] = Field(
+        default_factory=lambda: ["numbers"]
+    )
+    points: Annotated[int, Field(ge=100, le=10**6)] = 2000
+    tolerance: Annotated[float, Field(ge=1e-6, le=0.1)] = 0.01
+    least: Annotated[int, Field(ge=6, le=1000)] = 24
     views: Views = Views()
     descent: Stage
     weights: Annotated[dict[str, Weights], Field(min_length=1)] = Field(
         default_factory=lambda: {"depths and normals": Weights(mask=0)}
     )
+    lines: Annotated[int, Field(ge=1, le=64)] = 1
+    parts: Annotated[int, Field(ge=1, le=64)] = 2
     keeping: Annotated[float, Field(ge=0)] = 1e-3
     record_every: Annotated[int, Field(ge=1)] = 20
     checkpoint_every: Annotated[int, Field(ge=1)] = 20
 
 
 def units(config: Config) -> list[Unit]:
-    """One for each way to compare."""
+    """One for each of what is recovered and each way to compare."""
     pixels = config.descent.iterations * config.views.at_once * config.views.size**2
-    return [Unit(name, name, _SECONDS * pixels) for name in config.weights]
+    return [
+        Unit(f"{unknown}/{name}", f"{unknown}, by {name}", _SECONDS * pixels)
+        for unknown in config.unknowns
+        for name in config.weights
+    ]
 
 
 @dataclass(frozen=True)
-class CoverProblem:
-    """min over a cover of the weighted mean squares of the differences of depths and normals, + penalty."""
+class Numbers:
+    """Discs: b along noisy normals, A and c 0; radii by their logarithms."""
 
     config: Config
-    weights: Weights
-    target: Slim
-    training: list[Camera]
-    held_out: list[Camera]
-    wanted: Images
-    judged: Images
-
-    @classmethod
-    def of(cls, config: Config, name: str) -> CoverProblem:
-        """With all images of the target."""
-        target = Slim(*covers.torus(config.target_balls), offset=config.offset)
-        training, held_out = config.views.cameras(target.domain)
-        with torch.no_grad():
-            wanted, judged = (_images(config, target, cameras) for cameras in (training, held_out))
-        return cls(config, config.weights[name], target, training, held_out, wanted, judged)
 
     def start(self) -> Parameters:
-        """Discs: b along noisy normals, A and c 0; radii by their logarithms."""
         rough, noise = covers.torus(self.config.balls), self.config.noise
-        rng = torch.Generator().manual_seed(self.config.seed)
-        draw = lambda like: torch.randn(like.shape, generator=rng, dtype=torch.float64)  # noqa: E731
+        draw = _drawn(self.config)
         normal = torch.nn.functional.normalize(rough.b + 0.5 * noise * draw(rough.b))
         return {
             "centers": rough.centers + noise * rough.radii[:, None] * draw(rough.centers) / math.sqrt(3),
@@ -95,13 +97,74 @@ class CoverProblem:
             "c": torch.zeros_like(rough.c),
         }
 
+    def cover(self, parameters: Parameters) -> Slim:
+        centers, sizes, *rest = parameters.values()
+        return Slim(centers, sizes.exp(), *rest, offset=self.config.offset)
+
+    def strayed(self, parameters: Parameters) -> Tensor:
+        return (parameters["sizes"] - self.start()["sizes"]).square().mean()
+
+
+class Points:
+    """Those that a cover was fitted to, off a torus by noise; their fits are solved again."""
+
+    def __init__(self, config: Config) -> None:
+        even = covers.torus(config.points).centers
+        self.apart = math.sqrt(4 * math.pi**2 * covers.MAJOR * covers.MINOR / len(even))
+        self.points = even + config.noise * self.apart * _drawn(config)(even)
+        self.fitted = fit_slim(self.points, tolerance=config.tolerance, least=config.least, seed=config.seed)
+        self.fitted.offset = config.offset
+
+    def start(self) -> Parameters:
+        return {"points": self.points.clone()}
+
+    def cover(self, parameters: Parameters) -> Slim:
+        return self.fitted.refitted(parameters["points"])
+
+    def strayed(self, parameters: Parameters) -> Tensor:
+        return (parameters["points"] - self.points).square().sum(-1).mean() / self.apart**2
+
+
+def _drawn(config: Config) -> Callable[[Tensor], Tensor]:
+    """Normal numbers, as many as of another tensor."""
+    rng = torch.Generator().manual_seed(config.seed)
+    return lambda like: torch.randn(like.shape, generator=rng, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class CoverProblem:
+    """min over unknowns of the weighted mean squares of the differences of masks, depths, normals, + penalty."""
+
+    config: Config
+    unknown: Numbers | Points
+    weights: Weights
+    target: Slim
+    training: list[Camera]
+    held_out: list[Camera]
+    wanted: Images
+    judged: Images
+
+    @classmethod
+    def of(cls, config: Config, unknown: str, name: str) -> CoverProblem:
+        """With all images of the target."""
+        target = Slim(*covers.torus(config.target_balls), offset=config.offset)
+        training, held_out = config.views.cameras(target.domain)
+        with torch.no_grad():
+            wanted, judged = (_images(config, target, cameras) for cameras in (training, held_out))
+        own = {"numbers": Numbers, "points": Points}[unknown](config)
+        return cls(config, own, config.weights[name], target, training, held_out, wanted, judged)
+
+    def start(self) -> Parameters:
+        return self.unknown.start()
+
     def refine(self, parameters: Parameters, stage: int) -> Parameters:
         raise AssertionError("there is one stage")
 
     def loss(self, parameters: Parameters, stage: int, iteration: int) -> tuple[Tensor, Tensor]:
-        views = self.config.views.of_step(iteration, self.config.seed)
-        images = _images(self.config, cover(self.config, parameters), [self.training[k] for k in views])
-        penalty = self.config.keeping * (parameters["sizes"] - self.start()["sizes"]).square().mean()
+        config, views = self.config, self.config.views.of_step(iteration, self.config.seed)
+        edges = {"silhouettes": Silhouettes(config.lines, config.parts), "seed": iteration} if self.weights.mask else {}
+        images = _images(config, self.unknown.cover(parameters), [self.training[k] for k in views], **edges)
+        penalty = config.keeping * self.unknown.strayed(parameters)
         return misfit(self.weights, images, Images(*(x[views] for x in self.wanted))), penalty
 
     def project(self, parameters: Parameters) -> None:
@@ -109,19 +172,13 @@ class CoverProblem:
 
     @torch.no_grad()
     def observe(self, parameters: Parameters, stage: int) -> Record:
-        found = cover(self.config, parameters)
+        found = self.unknown.cover(parameters)
         seen = compared(_images(self.config, found, self.held_out), self.judged)
         return {**seen, "distance": _distance(self.config, found, self.held_out)}
 
 
-def cover(config: Config, parameters: Parameters) -> Slim:
-    """The surface that parameters stand for."""
-    centers, sizes, *rest = parameters.values()
-    return Slim(centers, sizes.exp(), *rest, offset=config.offset)
-
-
-def _images(config: Config, surface: Slim, cameras: list[Camera]) -> Images:
-    return images_of(surface, cameras, config.views.size, dtype=torch.float64)
+def _images(config: Config, surface: Slim, cameras: list[Camera], **options: Any) -> Images:
+    return images_of(surface, cameras, config.views.size, dtype=torch.float64, **options)
 
 
 def _distance(config: Config, surface: Slim, cameras: list[Camera]) -> float:
@@ -136,21 +193,19 @@ def _distance(config: Config, surface: Slim, cameras: list[Camera]) -> float:
 
 def compute(config: Config, unit: Unit, run: Run) -> Record:
     """The record of one recovery."""
-    problem = CoverProblem.of(config, unit.key)
+    unknown, name = unit.key.split("/", 1)
+    problem, key = CoverProblem.of(config, unknown, name), unit.key.replace(" ", "-").replace("/", "--")
     state = minimize(
         problem,
         [config.descent],
-        run.folder / "files" / f"{run.prefix}{unit.key}.state.pt".replace(" ", "-"),
+        run.folder / "files" / f"{run.prefix}{key}.state.pt",
         observe_every=config.record_every,
         checkpoint_every=config.checkpoint_every,
         progress=run.advance,
     )
-    found = {name: x.detach() for name, x in state.parameters.items()}
-    surfaces = {
-        "target": problem.target,
-        "start": cover(config, problem.start()),
-        "result": cover(config, found),
-    }
+    result = problem.unknown.cover({name: x.detach() for name, x in state.parameters.items()})
+    surfaces = {"target": problem.target, "start": problem.unknown.cover(problem.start()), "result": result}
     cameras = {"training": problem.training[0], "held_out": problem.held_out[0]}
-    images = save_views(surfaces, cameras, config.views.shown, unit.key.replace(" ", "-"), run)
-    return {"compared": unit.key, "balls": len(found["c"]), **course(state), "images": images, "files": files(images)}
+    images = save_views(surfaces, cameras, config.views.shown, key, run)
+    seen = {"unknown": unknown, "compared": name, "balls": len(result)}
+    return {**seen, **course(state), "images": images, "files": files(images)}

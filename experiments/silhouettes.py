@@ -25,13 +25,14 @@ from scipy.stats import t as student
 from torch import Tensor
 
 import filterlab as fl
+from experiments import covers
 from experiments.config import ExperimentConfig, Recipe
 from experiments.runs import Record, Run, Unit
 from filterlab.render import Light, PerspectiveCamera, Phong, Silhouettes, raycast
 from filterlab.render.materials import Material, Seen
-from filterlab.surfaces import LevelSet
+from filterlab.surfaces import LevelSet, Quadrics, Slim, Surface
 
-Volume = Literal["ball", "bumps", "cut"]
+Volume = Literal["ball", "bumps", "cut", "quadrics", "cover"]
 Parameter = Literal["level", "sample", "camera"]
 Quantity = Literal["mask", "depth", "shaded"]
 
@@ -50,7 +51,7 @@ class Config(ExperimentConfig):
     """Which derivatives are judged.
 
     Attributes:
-        methods, volumes, parameters, quantities: every combination is a unit.
+        methods, volumes, parameters, quantities: every combination is a unit; methods have no part in quadrics, covers.
         size: pixels along an edge of the estimates; subpixels: s² rays in each, for the part between edges.
         lines, parts: of `Silhouettes`.
         estimates: how many are made, each with a seed of its own.
@@ -74,8 +75,8 @@ class Config(ExperimentConfig):
         """Unit keys -> what is judged."""
         return {
             f"{m.key}/{v}/{p}/{q}": (m, v, p, q)
-            for m in self.methods
             for v in self.volumes
+            for m in (self.methods[:1] if v in IN_PIECES else self.methods)
             for p in self.parameters
             for q in self.quantities
         }
@@ -165,6 +166,7 @@ class Scene:
     """An image of a volume that one number θ changes, at θ = 0.
 
     A `ball` is −|x|² / 10; `bumps` adds noise, so that parts hide parts; `cut` is that in a region that cuts it open.
+    `quadrics` are ellipsoids, one of which a plane cuts; a `cover` is one of a torus, without the balls of one side.
     """
 
     recipe: Recipe
@@ -172,7 +174,9 @@ class Scene:
     parameter: Parameter
     quantity: Quantity
 
-    def surface(self, theta: Tensor) -> LevelSet:
+    def surface(self, theta: Tensor) -> Surface:
+        if self.volume in IN_PIECES:
+            return IN_PIECES[self.volume](theta, self.parameter)
         axis = torch.arange(_N, dtype=torch.float64) - _CENTER
         samples = -(axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2) / 10
         if self.volume != "ball":
@@ -241,6 +245,34 @@ class Scene:
         light = cast(row.repeat_interleave(_NODES), across.flatten(), "color")[..., self._channel].view_as(across)
         w = torch.tensor(_QUARTERS, dtype=torch.float64)[(v[row] >= 0.5).long(), (low >= 0.5).long()]
         return v.new_zeros(len(v)).index_add(0, row, w * (weights * light).sum(1)).view(repeats, rows).mean(1)
+
+
+def _ellipsoids(theta: Tensor, parameter: Parameter) -> Quadrics:
+    """Three, that hide parts of each other; of one a half. What changes is F of all, or the place of one."""
+    rows = lambda *x: torch.tensor(x, dtype=torch.float64)  # noqa: E731
+    moved = torch.stack((theta, torch.zeros_like(theta), theta)) if parameter == "sample" else torch.zeros(3).double()
+    centers = _CENTER + rows([0.0, 0, 0], [-1.6, -2, 0.5], [1.4, 1.5, -1.2]) + rows([0.0], [1.0], [0.0]) * moved
+    whole = Quadrics.ellipsoids(centers, rows([2.0, 1.2, 2.2], [1.2, 1.0, 0.8], [1.3, 1.5, 1.7]))
+    cuts = rows([0.6, 0.3, 0.74, -0.5], [0, 0, 1, -9], [0, 0, 1, -9])
+    cuts[:, 3] -= (cuts[:, :3] * centers.detach()).sum(-1)
+    offset = theta if parameter == "level" else torch.zeros_like(theta)
+    return Quadrics(whole.A, whole.b, whole.c - offset, whole.bounds, whole.origins, cuts=cuts)
+
+
+def _cover(theta: Tensor, parameter: Parameter) -> Slim:
+    """A torus without the balls of one side. What changes is F of all, or the places and sizes of balls at that end."""
+    centers, radii, A, b, c = covers.torus(300)
+    kept = centers[:, 0] < 0.5
+    centers, radii, A, b, c = (x[kept] for x in (centers, radii, A, b, c))
+    turn = torch.linalg.qr(torch.tensor([[0.5, 1.0, 0.2], [1.0, -0.4, 0.5], [0.3, 0.5, -1.0]], dtype=torch.float64))[0]
+    own = theta * (centers[:, 0] > 0.3) if parameter == "sample" else torch.zeros_like(radii)
+    centers = _CENTER + 2.2 * (turn * centers[:, None]).sum(-1) + own[:, None] * turn[:, 0]
+    A, b = torch.einsum("ij,mjk,lk->mil", turn, A, turn), (turn * b[:, None]).sum(-1)
+    offset = theta if parameter == "level" else torch.zeros_like(theta)
+    return Slim(centers, 2.2 * radii + own, A / 2.2, b, c - offset)
+
+
+IN_PIECES: dict[str, Callable[[Tensor, Parameter], Surface]] = {"quadrics": _ellipsoids, "cover": _cover}
 
 
 # --- the reference ----------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ _MARGIN = 8  # data that are written out beyond the ends
 _NONE = 1e-12  # pieces that are shorter, of the way in the domain, are none
 _TOUCHES = 1e-9  # rays that are no longer than this in the domain, of t, are undecided
 _HALVINGS = 40
+_ROUNDING = 1e-14  # of heights of a few units
 _N = 4
 
 _VALUES = np.array([[comb(_N, i) * x**i * (1 - x) ** (_N - i) for i in range(_N + 1)] for x in np.arange(5) / 4])
@@ -41,10 +42,12 @@ class Crossings:
 
     Attributes:
         t: (R, K) in order, ∞ behind the last.
+        loose: (R, K) how far rounding may move them: much, where a ray leaves the ground at a slope of 1e-9.
         undecided: (R,) whether rounding decides what there is.
     """
 
     t: np.ndarray
+    loose: np.ndarray
     undecided: np.ndarray
 
     @property
@@ -56,7 +59,7 @@ class Crossings:
         return (self.t < np.inf).sum(1)
 
     def chosen(self, which: slice) -> Crossings:
-        return Crossings(self.t[which], self.undecided[which])
+        return Crossings(self.t[which], self.loose[which], self.undecided[which])
 
 
 class Ground:
@@ -117,8 +120,11 @@ def crossings(f: Ground, origins: np.ndarray, directions: np.ndarray, close: flo
     entry, way = (o + np.where(near < np.inf, near, 0)[:, None] * d).astype(np.float64), d.astype(np.float64)
     number, c = _pieces(f, entry[line], way[line], low, high, close)
     parts = _parted(number, c, close)
-    own, s, undecided = _rows(parts, line, low, high, close, len(o))
-    return _in_rows(own, near[own] + s, undecided | touching, len(o))
+    own, s, loose, undecided = _rows(parts, line, low, high, close, len(o))
+    place, count = _in_rows(own, len(o))
+    t, apart = np.full((2, len(o), count), np.inf)
+    t[own, place], apart[own, place] = (near[own] + s).astype(np.float64), loose
+    return Crossings(t, apart, undecided | touching)
 
 
 def _domain(f: Ground, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -198,6 +204,8 @@ def _parted(piece: np.ndarray, c: np.ndarray, close: float) -> _Parts:
     """All parts that are left, in order."""
     start, width, done = np.zeros(len(piece)), np.ones(len(piece)), []
     for halving in range(_HALVINGS + 1):
+        if halving and not len(piece):
+            break
         left = ~((c > close).all(1) | (c < -close).all(1))
         piece, start, width, c = piece[left], start[left], width[left], c[left]
         steps = np.diff(c, axis=1)
@@ -220,8 +228,8 @@ def _halves(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(left, 1), np.stack(right[::-1], 1)
 
 
-def _rows(parts: _Parts, line, low, high, close: float, rays: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whose crossings there are, in order, and where; and rays (R,) that are undecided."""
+def _rows(parts: _Parts, line, low, high, close: float, rays: int) -> tuple[np.ndarray, ...]:
+    """Whose crossings there are, in order, where, and how loose; and rays (R,) that are undecided."""
     own, first, last = line[parts.piece], parts.c[:, 0], parts.c[:, -1]
     ends = parts.start + parts.width
     follows = parts.piece[1:] == parts.piece[:-1] + np.where(ends[:-1] == 1, 1, 0)
@@ -237,8 +245,15 @@ def _rows(parts: _Parts, line, low, high, close: float, rays: int) -> tuple[np.n
     while (on := parts.c[begin, -1] * sign <= 0).any():  # the part in which it does
         begin = begin + on
     found = parts.chosen(begin)
-    x = found.start + found.width * _bisected(found.c, sign)
-    return own[begin], low[found.piece] + (high - low)[found.piece] * x, undecided
+    within = _bisected(found.c, sign)
+    length = (high - low)[found.piece]
+    loose = _ROUNDING * found.width * length / np.abs(_slope(found.c, within))
+    return own[begin], low[found.piece] + length * (found.start + found.width * within), loose, undecided
+
+
+def _slope(c: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Of polynomials (Q, 5) at x (Q,)."""
+    return _N * sum(comb(3, i) * own * x**i * (1 - x) ** (3 - i) for i, own in enumerate(np.diff(c, axis=1).T))
 
 
 def _bisected(c: np.ndarray, sign: np.ndarray) -> np.ndarray:
@@ -253,8 +268,7 @@ def _bisected(c: np.ndarray, sign: np.ndarray) -> np.ndarray:
     return (a + b) / 2
 
 
-def _in_rows(own: np.ndarray, t: np.ndarray, undecided: np.ndarray, rays: int) -> Crossings:
+def _in_rows(own: np.ndarray, rays: int) -> tuple[np.ndarray, int]:
+    """Which crossing of its ray each is, of rays in order, and how many there are at most, 1 at least."""
     count = np.bincount(own, minlength=rays)
-    every = np.full((rays, max(count.max(initial=0), 1)), np.inf)
-    every[own, np.arange(len(own)) - (np.cumsum(count) - count)[own]] = t.astype(np.float64)
-    return Crossings(every, undecided)
+    return np.arange(len(own)) - (np.cumsum(count) - count)[own], max(count.max(initial=0), 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from filterlab import bernstein, kernels
 from filterlab.fields import ranges as bounds
 from filterlab.kernels import KERNELS
 from filterlab.methods import from_kernel
+from filterlab.ops.differentiable.bounds import bits_of_blocks
 from filterlab.ops.raycast import marks_of, marks_of_bits
 from filterlab.ops.reference import bounds as hulls
 from tests import oracles
@@ -273,9 +275,12 @@ def test_bounds_are_the_hulls_of_the_cells(name, edge):
     assert bool(most.isfinite().all())
 
 
+@pytest.mark.parametrize("implementation", ["reference", "cpu"])
 @pytest.mark.parametrize("shape", [(1, 1, 1), (3, 2, 64), (2, 17, 129), (16, 24, 40)])
-def test_marks_are_those_of_parts_one_by_one(shape):
+def test_marks_are_those_of_parts_one_by_one(shape, implementation, monkeypatch):
     """Blocks, words and bytes against their definition, a brick at a time."""
+    found = partial(bits_of_blocks, implementation=implementation)
+    monkeypatch.setattr(bounds, "bits_of_blocks", found)
     generator = torch.Generator().manual_seed(sum(shape))
     low = (torch.randn(shape, generator=generator) * 500).short()
     high = low + 30

@@ -11,7 +11,6 @@ from torch import Tensor
 from filterlab.ops.differentiable import quadrics
 from filterlab.ops.reference import quadrics as reference
 from filterlab.render import PerspectiveCamera, raycast
-from filterlab.render.silhouettes import Silhouettes
 from filterlab.surfaces import Bounds, Planes, Quadrics, Spheres, Tetrahedra, mesh
 from tests import quadric_rays
 
@@ -494,8 +493,5 @@ def test_what_needs_one_function_says_so():
     surface = balls(3)
     with pytest.raises(TypeError, match="a mesh is that of one function"):
         mesh(surface)
-    camera = PerspectiveCamera.framing(surface.domain)
-    with pytest.raises(TypeError, match="silhouettes are those of one function"):
-        raycast(surface, camera, size=(4, 4), silhouettes=Silhouettes())
     with pytest.raises(ValueError, match="expected which one as piece"):
         surface.jet(torch.zeros(1, 3), 0)

@@ -14,7 +14,7 @@ from experiments.silhouettes import Depth, Scene, between, chance, mean_and_erro
 from filterlab.render import Light, OrthographicCamera, PerspectiveCamera, Phong, Silhouettes, raycast, silhouettes
 from filterlab.render.image import PixelRays, check_background
 from filterlab.render.raycast import Casting
-from filterlab.surfaces import LevelSet
+from filterlab.surfaces import BilinearQuads, LevelSet, Quadrics, Slim, Spheres, Surface
 from tests.test_methods import CONTINUOUS
 
 F64 = torch.float64
@@ -39,7 +39,7 @@ def camera(**changes) -> OrthographicCamera:
     return OrthographicCamera(up=(0, 0, 1), **given)
 
 
-def cast(surface: LevelSet, lines: int = 1, seen=None, **options) -> Tensor:
+def cast(surface: Surface, lines: int = 1, seen=None, **options) -> Tensor:
     how = Silhouettes(lines) if lines else None
     return raycast(surface, seen or camera(), size=SIZE, dtype=F64, silhouettes=how, **options)
 
@@ -88,6 +88,32 @@ def test_edges_move_as_their_derivative_says(method):
         assert wide.all()
 
 
+@pytest.mark.parametrize("volume", ["quadrics", "cover"])
+@pytest.mark.parametrize("parameter", ["level", "sample", "camera"])
+def test_edges_of_pieces_move_as_their_derivative_says(volume, parameter):
+    """Where rays touch a piece, and where one ends at its ball or plane."""
+    scene = Scene(Recipe.model_validate("triquadratic"), volume, parameter, "mask")
+
+    def at(theta: Tensor) -> silhouettes.Eye:
+        return seen_by(scene.surface(theta), scene.camera(theta), size=(9, 9))
+
+    theta, step = torch.zeros((), dtype=F64, requires_grad=True), 1e-5
+    own = at(theta)
+    with torch.no_grad():
+        edges = silhouettes._found(own, silhouettes._Lines.drawn(torch.arange(81), 3, 0), 3)
+    assert int(edges.fold.sum()) > 3
+    assert int((edges.bound >= 0).sum()) > 2
+    assert not (edges.fold & (edges.bound >= 0)).any()
+    weights, across, down = silhouettes._slopes(own, edges)
+    m = (weights * silhouettes._values(own, own.surface, edges, edges.lines.place(edges.rich), edges.t)).sum(-1)
+    rows = torch.stack([torch.autograd.grad(x, theta, retain_graph=True)[0] for x in m])
+    motion = -step * rows / torch.where(edges.lines.across, across, down)
+    assert int((motion.abs() > 1e-8).sum()) > 2
+    near, wide = (there_again(at(theta.detach() + step), edges, motion, x) for x in (1e-3, 0.05))
+    assert float(near.double().mean()) > 0.9
+    assert wide.all()
+
+
 def there_again(own: silhouettes.Eye, edges, motion: Tensor, tolerance: float) -> Tensor:
     """Whether (Q,) numbers of hits change where edges should have moved to, give or take this part of the motion."""
     slack = tolerance * (motion.abs() + 1e-7) + 2e-9
@@ -105,11 +131,11 @@ def line_across(*values: float):
     return silhouettes._Lines(zero, zero, torch.ones(len(values), dtype=torch.bool), torch.tensor(values, dtype=F64))
 
 
-def seen_by(surface: LevelSet, view, region=None) -> silhouettes.Eye:
-    """One pixel."""
+def seen_by(surface: Surface, view, region=None, size: tuple[int, int] = (1, 1)) -> silhouettes.Eye:
+    """One pixel, or some."""
     background = check_background((0, 0, 0), torch.device("cpu"))
     casting = Casting(surface, Phong(), (), background, region, 1, False, F64)
-    return casting.eye(PixelRays.of(view, (1, 1), torch.device("cpu")), ("color",))
+    return casting.eye(PixelRays.of(view, size, torch.device("cpu")), ("color",))
 
 
 def test_lines_go_evenly_both_ways():
@@ -165,6 +191,34 @@ def test_area_and_place_of_a_ball():
     assert abs(float(gone)) == pytest.approx(2 * RADIUS, rel=0.1)  # the diameter leaves to the left
 
 
+def area_of(surface: Surface) -> Tensor:
+    return cast(surface, 16)[..., 3].mean() * 9.0 * 9.0 * SIZE[0] / SIZE[1]
+
+
+@pytest.mark.parametrize("faces", ["front", "back", "both"])
+def test_area_of_a_quadric(faces):
+    """Whichever sides are seen a ball covers π r²."""
+    radius = torch.tensor([RADIUS], dtype=F64, requires_grad=True)
+    ball = Quadrics.ellipsoids(torch.full((1, 3), CENTER, dtype=F64), radius, faces=faces)
+    (grown,) = torch.autograd.grad(area_of(ball), radius)
+    assert float(grown) == pytest.approx(2 * math.pi * RADIUS, rel=0.04)
+
+
+def test_area_of_what_ends():
+    """A disc that its ball ends: π r² cos; a ball, of which a plane leaves a part: its circle's arc moves."""
+    middle, tilt = torch.full((1, 3), CENTER, dtype=F64), 0.7
+    radius = torch.tensor([RADIUS], dtype=F64, requires_grad=True)
+    normal = torch.tensor([[0.0, -math.cos(tilt), math.sin(tilt)]], dtype=F64)
+    disc = Slim(middle, radius, torch.zeros(1, 3, 3, dtype=F64), normal / 2, torch.zeros(1, dtype=F64))
+    (grown,) = torch.autograd.grad(area_of(disc), radius)
+    assert float(grown) == pytest.approx(2 * math.pi * RADIUS * math.cos(tilt), rel=0.04)
+    ball = Quadrics.ellipsoids(middle, radius)
+    cut = torch.tensor([[1.0, 0, 0, -CENTER - RADIUS / 2]], dtype=F64)
+    bounds = Spheres(middle, 2 * RADIUS)
+    (grown,) = torch.autograd.grad(area_of(Quadrics(ball.A, ball.b, ball.c, bounds, ball.origins, cuts=cut)), radius)
+    assert float(grown) == pytest.approx(2 * RADIUS * (math.pi - math.acos(0.5)), rel=0.04)
+
+
 @pytest.mark.parametrize("cut", [0.5, 1.5, 2.5])
 def test_depth_of_a_ball_without_its_front(cut):
     """y over a background of the middle's y, so that the outline, where y is that, has no part in it.
@@ -183,7 +237,12 @@ def test_depth_of_a_ball_without_its_front(cut):
 
 @pytest.mark.parametrize(
     ("volume", "parameter", "quantity"),
-    [("bumps", "level", "depth"), ("cut", "camera", "shaded")],
+    [
+        ("bumps", "level", "depth"),
+        ("cut", "camera", "shaded"),
+        ("quadrics", "sample", "mask"),
+        ("cover", "level", "mask"),
+    ],
 )
 def test_derivatives_are_those_of_means(volume, parameter, quantity):
     """Against differences of integrals along rows, of which nothing is shared with how edges are found."""
@@ -298,3 +357,7 @@ def test_what_has_no_edges_is_refused():
         raycast(ball(), camera(), size=SIZE, silhouettes=2)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="go with a camera"):
         raycast(ball(), camera().rays(*SIZE), silhouettes=Silhouettes())
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 1]])
+    quads = BilinearQuads(corners, torch.tensor([[0, 1, 2, 3]]))
+    with pytest.raises(TypeError, match="need a surface that tells where its pieces end; got BilinearQuads"):
+        raycast(quads, camera(), size=SIZE, silhouettes=Silhouettes())

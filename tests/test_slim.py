@@ -13,7 +13,6 @@ from experiments.covers import distance, torus
 from filterlab.io import is_slim, load_slim, save_slim
 from filterlab.ops.differentiable import quadrics
 from filterlab.render import Light, PerspectiveCamera, Phong, raycast
-from filterlab.render.silhouettes import Silhouettes
 from filterlab.surfaces import Quadrics, Slim, Spheres, mesh
 from tests import slim_oracle
 
@@ -408,6 +407,3 @@ def test_what_needs_one_function_says_so():
     surface = Slim(*torus(50))
     with pytest.raises(TypeError, match="a mesh is that of one function, as a level set has; got Slim"):
         mesh(surface)
-    camera = PerspectiveCamera.framing(surface.domain)
-    with pytest.raises(TypeError, match="silhouettes are those of one function, as a level set has; got Slim"):
-        raycast(surface, camera, size=(4, 4), silhouettes=Silhouettes())

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from experiments import covers
 from experiments.report.inverse_surface import CAPTION, VIEWS, convergence, two_rows
 from experiments.report.page import Column, Gallery, Section, Table
 from experiments.report.style import OTHERS, fixed, text
@@ -26,29 +27,48 @@ def draw(config: Config, records: Mapping[str, Record], folder: Path) -> Section
     """The section of the report."""
     listed = list(records.values())
     parts = [Section(title, (), [_view(listed, view, folder)]) for view, title in VIEWS.items()]
-    names = list(config.weights)
-    look = lambda r: {"color": OTHERS[names.index(r["compared"]) % len(OTHERS)].light, "label": r["compared"]}  # noqa: E731
+    names = [f"{unknown}, {name}" for unknown in config.unknowns for name in config.weights]
+    look = lambda r: {"color": OTHERS[names.index(_name(r)) % len(OTHERS)].light, "label": _name(r)}  # noqa: E731
     drawn = convergence(listed, look, PANELS, "inverse-slim")
     parts.append(Section("Convergence", (), [drawn, _numbers(listed)]))
-    return Section("A rough cover, refined by depths and normals", _lead(config, listed), (), parts)
+    return Section("A rough cover, refined by what images show", _lead(config, listed), (), parts)
+
+
+def _name(record: Record) -> str:
+    return f"{record['unknown']}, {record['compared']}"
 
 
 def _lead(config: Config, records: Sequence[Record]) -> list[str]:
-    views = config.views
-    balls = records[0]["balls"] if records else config.balls
-    return [
-        f"The target is a torus, R = 1, r = 0.4. {balls} balls start on it, each with a flat disc, off by "
-        f"{config.noise:g} radii in place, {config.noise / 2:g} in size and {config.noise:g} radians in direction. "
-        f"Places, radii and quadrics are refined by {config.descent.iterations} steps of Adam through the blended hits "
-        f"of {views.training} views of {views.size}² pixels, {views.at_once} at a time; {views.held_out} others are "
-        "never matched.",
-        "Depths and normals are compared where both are hit. Outlines pull at nothing: of covers there is no "
-        "derivative of edges. Radii are held near those of the start.",
-    ]
+    views, found = config.views, {r["unknown"]: r["balls"] for r in records}
+    told = [f"The target is a torus, R = {covers.MAJOR:g}, r = {covers.MINOR:g}."]
+    if "numbers" in found:
+        told.append(
+            f"Numbers: {found['numbers']} balls start on it, each with a flat disc, off by {config.noise:g} radii in "
+            f"place, {config.noise / 2:g} in size and {config.noise:g} radians in direction; places, radii and "
+            "quadrics are refined. Radii are held near those of the start."
+        )
+    if "points" in found:
+        told.append(
+            f"Points: {config.points} about evenly on it, off by {config.noise:g} of their distance along each axis, "
+            f"to which {found['points']} balls are fitted. Points are refined; the local fits are solved again at "
+            "every step. They are held near where they start."
+        )
+    told.append(
+        f"{config.descent.iterations} steps of Adam through the blended hits of {views.training} views of "
+        f"{views.size}² pixels, {views.at_once} at a time; {views.held_out} others are never matched."
+    )
+    edges = [name for name, weights in config.weights.items() if weights.mask]
+    matched = (
+        f"Depths and normals are compared where both are hit. With masks ({', '.join(edges)}) derivatives are also "
+        f"those of what edges sweep over, along {config.lines} lines of {config.parts} parts through every pixel."
+        if edges
+        else "Depths and normals are compared where both are hit; outlines pull at nothing."
+    )
+    return [" ".join(told), matched]
 
 
 def _view(records: Sequence[Record], view: str, folder: Path) -> Gallery:
-    pictures = [p for r in records for p in two_rows(r["images"][view], r["compared"], folder)]
+    pictures = [p for r in records for p in two_rows(r["images"][view], _name(r), folder)]
     return Gallery(pictures, CAPTION, columns=4)
 
 
@@ -61,8 +81,9 @@ def _numbers(records: Sequence[Record]) -> Table:
         Column("normal", "mean angle, °"),
         Column("time", "s"),
     ]
-    rows = [_row("start", records[0]["observations"][0], None)] if records else []
-    rows += [_row(r["compared"], r["observations"][-1], r.get("seconds")) for r in records]
+    starts = {r["unknown"]: r["observations"][0] for r in records}
+    rows = [_row(f"start of {unknown}", seen, None) for unknown, seen in starts.items()]
+    rows += [_row(_name(r), r["observations"][-1], r.get("seconds")) for r in records]
     return Table(columns, rows, "Held-out views. Wall-clock seconds; they depend on what else ran.")
 
 

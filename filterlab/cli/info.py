@@ -267,7 +267,7 @@ def _distribution(samples: np.ndarray, progress: Callable[[float], None]) -> lis
 def _bars(counts: list[int], low: float, span: float) -> list[tuple[str, str]]:
     """One line per bin: where it begins, its share, and a bar on a logarithmic scale (1 voxel to all of them)."""
     total, width = sum(counts), span / len(counts)
-    lines = []
+    lines = [("values", "share of all; bars are logarithmic")]
     for i, count in enumerate(counts):
         bar = "█" * (1 + round(29 * math.log(count) / max(math.log(total), 1e-9))) if count else ""
         lines.append((f"from {low + i * width:.6g}", f"{100 * count / total:6.2f} %  {bar}"))

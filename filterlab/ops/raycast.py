@@ -155,22 +155,6 @@ def bits_of(parts: Tensor) -> Tensor:
     return bits
 
 
-def bits_of_blocks(parts: Tensor) -> Tensor:
-    """`bits_of` (K, 8, 8, 8) parts, which lie together; on a CPU by bytes of eight parts along x."""
-    if parts.device.type != "cpu":
-        return bits_of(parts)
-    rows = np.packbits(parts.numpy().reshape(-1), bitorder="little")
-    fours = _PAIRS.take(rows).reshape(-1, 4, 2, 4, 2)  # a byte for each of four bricks
-    found = fours[:, :, 0, :, 0].copy()
-    for z, y in ((0, 1), (1, 0), (1, 1)):
-        found |= fours[:, :, z, :, y] << np.uint32(4 * z + 2 * y)
-    return torch.from_numpy(found.view(np.uint8).reshape(-1, 4, 4, 4))
-
-
-_PAIRS = np.stack([np.arange(256) >> shift & 3 for shift in (0, 2, 4, 6)], -1).astype(np.uint8).view(np.uint32)[:, 0]
-"""Of eight bits, two in each of four bytes."""
-
-
 def marks_of_bits(bits: Tensor) -> Tensor:
     """`Raycast.marks` from (bz, by, bx) uint8 of `bits_of`."""
     clear = _clear_of(bits > 0)  # either is 0

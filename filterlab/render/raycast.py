@@ -78,9 +78,9 @@ class Casting:
     def eye(self, seen: PixelRays, channels: Sequence[str]) -> Eye:
         """The same, for finding edges in those channels; in float64, or both sides of one would be the same ray."""
         exact = replace(self, dtype=torch.float64)
-        counting = replace(exact, sheets=COUNTED)
+        counting = replace(exact, surface=self.surface.detached, sheets=COUNTED)  # nothing is recorded of a search
         radiance = lambda o, d: exact(o, d, channels)  # noqa: E731
-        return Eye(self.surface, self.region, seen.rays, lambda inside: counting._hits(inside).t, radiance)
+        return Eye(self.surface, self.region, seen.rays, counting._hits, radiance)
 
     def _hits(self, inside: Spans) -> Hits:
         """Those within the spans: t (R, k) from where rays enter."""
@@ -261,7 +261,8 @@ def raycast(
         pixel's hit moves. It comes and goes only with `silhouettes`, of which there are first derivatives.
 
     Raises:
-        TypeError: no surface, camera, material or silhouettes; silhouettes of a surface in pieces. ValueError: numbers
+        TypeError: no surface, camera, material or silhouettes; silhouettes of a surface that cannot
+            tell where its pieces end. ValueError: numbers
             out of range, channels that are not known, more than one ray a pixel for other channels than the colour,
             silhouettes of rays without a camera.
     """
@@ -364,5 +365,5 @@ def _check_silhouettes(silhouettes: Silhouettes | None, surface: Surface, camera
         raise TypeError(f"silhouettes must be Silhouettes(lines, parts), or None; got {type(silhouettes).__name__}")
     if silhouettes is not None and not isinstance(camera, Camera):
         raise ValueError("silhouettes go with a camera: rays alone have no pixels that edges could sweep over")
-    if silhouettes is not None and surface.in_pieces:
-        raise TypeError(f"silhouettes are those of one function, as a level set has; got {type(surface).__name__}")
+    if silhouettes is not None and surface.in_pieces and not surface.tells_ends:
+        raise TypeError(f"silhouettes need a surface that tells where its pieces end; got {type(surface).__name__}")

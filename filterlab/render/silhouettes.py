@@ -19,6 +19,8 @@ What m is says the ray on the edge. With F = 0 the surface (`surfaces.base`), o 
 |---|---|
 | two hits become one and vanish | (s₂ F(o + t₁ d) − s₁ F(o + t₂ d)) / (s₂ − s₁), t₁ and t₂ held, s their slopes ∇F·d |
 | a hit leaves through a face of domain or region, or where rays begin | F of the point where the ray meets the face |
+| a ray touches a piece (quadrics, SLIM), one or both of whose hits vanish | F of the piece at o + t* d, s = 0 there |
+| a hit leaves the ball or plane that bounds its piece | distance from it of the hit, which moves (`Surface.ends`) |
 
 Of the first, the derivative along the ray is 0 by its weights, be it smooth there or a crease of the surface: so m is
 the extremum of F, whose place does not matter (the envelope theorem), and no second derivative of F is asked. Nothing
@@ -37,7 +39,7 @@ from torch import Tensor
 from filterlab.ops.reference.optics import dot
 from filterlab.render.image import Place
 from filterlab.render.rays import Region, Spans, jitter, spans
-from filterlab.surfaces.base import Surface
+from filterlab.surfaces.base import Hits, Surface
 
 COUNTED = 64
 """Hits of a ray that are told apart: edges behind the last are not seen."""
@@ -45,6 +47,7 @@ COUNTED = 64
 _CUT, _ROUNDS = 8, 10  # parts that what an edge lies in is cut into, and how often: L is that of 8⁻¹⁰ of it away
 _APART, _STEEP = 0.125, 1  # voxels, and times how far rays are apart, by which hits differ if there is an edge between
 _AT_FACE = 1e-4  # of the domain's diagonal: a hit that vanishes farther from a face is none that left through it
+_AMONG = 100  # times how far rays at both sides of an edge are apart, within which it is of what it is told from
 _STREAM = 1 << 48  # numbers from here on are drawn for lines, those below for subpixels
 
 
@@ -77,14 +80,14 @@ class Eye:
     Attributes:
         surface, region: as of `raycast`.
         rays: those of some pixels, through a place within each.
-        hits: t (R, `COUNTED`) of spans of rays, in order, from where they enter.
+        hits: (R, `COUNTED`) of spans of rays, in order, from where they enter.
         radiance: (R, width) of rays: what jumps.
     """
 
     surface: Surface
     region: Region | None
     rays: Callable[[Tensor, Place], tuple[Tensor, Tensor]]
-    hits: Callable[[Spans], Tensor]
+    hits: Callable[[Spans], Hits]
     radiance: Callable[[Tensor, Tensor], Tensor]
 
     def spans(self, lines: _Lines, x: Tensor) -> Spans:
@@ -93,8 +96,8 @@ class Eye:
         return spans(origins.detach(), directions.detach(), self.surface.domain, self.region)
 
     def sheets(self, lines: _Lines, x: Tensor) -> Tensor:
-        """Their hits (Q, `COUNTED`)."""
-        return self.hits(self.spans(lines, x))
+        """t of their hits (Q, `COUNTED`)."""
+        return self.hits(self.spans(lines, x)).t
 
     def apart(self, stretches: _Stretches) -> Tensor:
         """How far from each other (Q,) rays at both ends of stretches pass the middle of the domain."""
@@ -160,8 +163,10 @@ class _Edges(NamedTuple):
         low, high: (Q,) x just before and just behind.
         rich: (Q,) that of them with more hits.
         t: (Q, 2) of the two hits that vanish there, or twice the one, from where the ray enters.
-        fold: (Q,) whether they are two.
+        fold: (Q,) whether they are two, or the ray touches the piece of the one.
         entering: (Q,) whether one leaves where rays enter, not where they end.
+        piece: (Q,) of the first; None: the surface has none.
+        bound: (Q,) which of the ends of its piece it leaves through; −1: through none.
     """
 
     lines: _Lines
@@ -171,9 +176,11 @@ class _Edges(NamedTuple):
     t: Tensor
     fold: Tensor
     entering: Tensor
+    piece: Tensor | None
+    bound: Tensor
 
     def some(self, which: Tensor) -> _Edges:
-        return _Edges(self.lines.some(which), *(field[which] for field in self[1:]))
+        return _Edges(self.lines.some(which), *(None if field is None else field[which] for field in self[1:]))
 
 
 def swept(how: Silhouettes, eye: Eye, pixels: Tensor, seed: int) -> Tensor:
@@ -231,9 +238,37 @@ def _classified(eye: Eye, stretches: _Stretches) -> _Edges:
     t = more.gather(1, torch.stack((first, first + fold.long()), 1).clamp(max=COUNTED - 1))
     length = eye.spans(lines, rich).length
     entering = t[:, 0] < length / 2
+    edges = _Edges(lines, low, high, rich, t, fold, entering, None, torch.full_like(first, -1))
+    if eye.surface.in_pieces:
+        edges = _of_pieces(eye, edges, first, eye.apart(stretches))
     beyond = torch.where(entering, t[:, 0], (t[:, 0] - length).abs())
-    kept = fold | (beyond < _AT_FACE * eye.surface.domain.diagonal)
-    return _Edges(lines, low, high, rich, t, fold, entering).some(kept)
+    kept = edges.fold | (edges.bound >= 0) | (beyond < _AT_FACE * eye.surface.domain.diagonal)
+    return edges.some(kept)
+
+
+def _of_pieces(eye: Eye, edges: _Edges, first: Tensor, apart: Tensor) -> _Edges:
+    """The same, with the pieces of what vanishes, and whether rays touch them there or they end.
+
+    A ray that touches passes the surface within about as much as rays are apart, h = (F − s² / 2 d·H d) / |∇F|; hits
+    that leave what bounds a piece are as near to it, but for the angle at which the ray meets the surface.
+    """
+    found = eye.hits(eye.spans(edges.lines, edges.rich)).piece
+    assert found is not None
+    piece = found.gather(1, first[:, None])[:, 0].clamp_min(0)
+    surface, ray = eye.surface.detached, _rays(eye, edges, edges.lines.place(edges.rich))
+    points = ray.at(edges.t[:, :1])[:, 0].detach()
+    value, gradient, hessian = surface.jet(points, 2, piece)
+    d, size = ray.directions.detach(), gradient.norm(dim=-1)
+    slope = dot(gradient, d)
+    bend = (d[:, :, None] * hessian * d[:, None]).sum((-2, -1))
+    height = (value - slope * slope / (2 * bend)) / size
+    near, bound = surface.ends(points, piece).max(-1)
+    fold = height.abs() <= _AMONG * apart  # false where it is NaN
+    leaves = ~fold & (near.abs() * slope.abs() <= _AMONG * apart * size)
+    t = torch.where(fold, edges.t[:, 0] - slope / bend, edges.t[:, 0])
+    return edges._replace(
+        t=torch.stack((t, t), 1), fold=fold, piece=piece, bound=torch.where(leaves, bound, torch.full_like(bound, -1))
+    )
 
 
 def _vanishing(more: Tensor, fewer: Tensor) -> tuple[Tensor, Tensor]:
@@ -278,20 +313,61 @@ def _slopes(eye: Eye, edges: _Edges) -> tuple[Tensor, Tensor, Tensor]:
     u, v = (x.detach().requires_grad_() for x in edges.lines.place(edges.rich))
     t = edges.t.detach().requires_grad_()
     values = _values(eye, eye.surface.detached, edges, (u, v), t)
-    (slope,) = torch.autograd.grad(values.sum(), t, retain_graph=True)
-    near, far = slope.unbind(-1)
-    share = torch.where(edges.fold, (far / (far - near)).nan_to_num(0.5).clamp(0, 1), 1)
-    weights = torch.stack((share, 1 - share), -1)
+    share = torch.ones_like(u) if edges.piece is not None else _share(edges, values, t)
+    weights = torch.stack((share, 1 - share), -1).detach()
     across, down = torch.autograd.grad((weights * values).sum(), (u, v))
     return weights, across, down
 
 
-def _values(eye: Eye, surface: Surface, edges: _Edges, place: Place, t: Tensor) -> Tensor:
-    """F (Q, 2) of both points of folds, or twice that of the point on a face."""
+def _share(edges: _Edges, values: Tensor, t: Tensor) -> Tensor:
+    """(Q,) of the first of both points of folds; 1 of what is no fold."""
+    (slope,) = torch.autograd.grad(values.sum(), t, retain_graph=True)
+    near, far = slope.unbind(-1)
+    return torch.where(edges.fold, (far / (far - near)).nan_to_num(0.5).clamp(0, 1), 1)
+
+
+class _Rays(NamedTuple):
+    """Rays on edges.
+
+    Attributes:
+        origins, directions: (Q, 3). before: (Q, 1) from there to where they enter, held. faces: (Q, 1, 3) points where
+            they enter or leave.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    before: Tensor
+    faces: Tensor
+
+    def at(self, t: Tensor) -> Tensor:
+        """Points (Q, k, 3) at t (Q, k) from where they enter."""
+        return self.origins[:, None] + (self.before + t)[..., None] * self.directions[:, None]
+
+
+def _rays(eye: Eye, edges: _Edges, place: Place) -> _Rays:
     origins, directions = eye.rays(edges.lines.pixel, place)
-    inside = spans(origins, directions, surface.domain, eye.region)
+    inside = spans(origins, directions, eye.surface.domain, eye.region)
     before = dot((inside.entry - origins).detach(), directions.detach())[:, None]
-    folds = origins[:, None] + (before + t)[..., None] * directions[:, None]
     leaving = inside.entry + inside.length[:, None] * directions
     face = torch.where(edges.entering[:, None], inside.entry, leaving)[:, None]
-    return surface.jet(torch.where(edges.fold[:, None, None], folds, face), 0)[0]
+    return _Rays(origins, directions, before, face)
+
+
+def _values(eye: Eye, surface: Surface, edges: _Edges, place: Place, t: Tensor) -> Tensor:
+    """F (Q, 2) of both points of folds, or twice that of the point on a face; of pieces twice m."""
+    rays = _rays(eye, edges, place)
+    if edges.piece is not None:
+        return _piece_values(surface, edges, rays, t)[:, None].expand(-1, 2)
+    return surface.jet(torch.where(edges.fold[:, None, None], rays.at(t), rays.faces), 0)[0]
+
+
+def _piece_values(surface: Surface, edges: _Edges, rays: _Rays, t: Tensor) -> Tensor:
+    """m (Q,): F of the piece at o + t* d, or on a face; the distance from what bounds it of the hit, which moves."""
+    assert edges.piece is not None
+    points, bounded = rays.at(t[:, :1])[:, 0], edges.bound >= 0
+    on_face = ~edges.fold & ~bounded
+    value, gradient = surface.jet(torch.where(on_face[:, None], rays.faces[:, 0], points), 1, edges.piece)
+    slope = torch.where(bounded, dot(gradient, rays.directions).detach(), 1)
+    moved = points - torch.where(bounded, value / slope, 0)[:, None] * rays.directions
+    off = surface.ends(moved, edges.piece).gather(1, edges.bound.clamp_min(0)[:, None])[:, 0]
+    return torch.where(bounded, off, value)

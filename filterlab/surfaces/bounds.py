@@ -47,6 +47,11 @@ class Bounds:
     def __len__(self) -> int:
         return len(self.centers)
 
+    def distances(self, points: Tensor, piece: Tensor) -> Tensor:
+        """(..., 1 + H) of world points (..., 3) from ball and planes of those numbered (...), negative within."""
+        off = (points - self.centers[piece]).norm(dim=-1) - self.radii[piece]
+        return torch.cat((off[..., None], plane_distances(points, self.planes[piece])), -1)
+
     def cut(self, planes: Tensor) -> Bounds:
         """The same, with (M, K, 4) or (M, 4) more planes: n·x + d ≤ 0 is kept. Raises as `Planes` does."""
         planes = planes[:, None] if isinstance(planes, Tensor) and planes.ndim == 2 else planes
@@ -124,6 +129,11 @@ class Planes(Bounds):
         lower, upper = (torch.cat(ends) for ends in zip(*parts, strict=True))
         center = (lower + upper) / 2
         super().__init__(center, (upper - lower).norm(dim=-1) / 2, planes, Boxes(lower, upper))
+
+
+def plane_distances(points: Tensor, planes: Tensor) -> Tensor:
+    """n·x + d (..., H) of points (..., 3) and planes (..., H, 4)."""
+    return (planes[..., :3] * points[..., None, :]).sum(-1) + planes[..., 3]
 
 
 def check_positive(name: str, numbers: Tensor) -> None:

@@ -53,6 +53,8 @@ class Quadrics(InTree[description.Quadrics]):
             that are both 0, of which nothing is a surface.
     """
 
+    tells_ends = True
+
     def __init__(
         self,
         A: Tensor,
@@ -195,6 +197,10 @@ class Quadrics(InTree[description.Quadrics]):
         turned = (A * y[..., None, :]).sum(-1)
         derivatives = (y * (turned + 2 * b)).sum(-1) + c, 2 * (turned + b), 2 * A
         return tuple(x.to(points.dtype) for x in derivatives[: order + 1])
+
+    def ends(self, points: Tensor, piece: Tensor) -> Tensor:
+        """Distances (..., 1 + H) from the balls and planes that bound the quadrics numbered by `piece` (...)."""
+        return self.bounds.distances(points.double(), piece)
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:

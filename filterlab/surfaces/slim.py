@@ -35,10 +35,11 @@ from torch import Tensor
 from filterlab.arrays import Array
 from filterlab.fields.base import Domain
 from filterlab.ops.differentiable import slim as ops
+from filterlab.ops.reference.hit_points import length
 from filterlab.ops.reference.slim import weight
 from filterlab.ops.slim import Cover, Members
-from filterlab.surfaces.base import Hits, Surface, SurfacePoints, geometry, length
-from filterlab.surfaces.bounds import Spheres, check_rows
+from filterlab.surfaces.base import Hits, Surface, SurfacePoints, geometry
+from filterlab.surfaces.bounds import Spheres, check_rows, plane_distances
 from filterlab.surfaces.quadrics import Quadrics
 
 _T, _ENDS, _NORMAL = 0, slice(1, 3), slice(3, 6)  # of `Hits.blend`: t, begin and end (`ops.slim`), Σ w n
@@ -73,6 +74,7 @@ class Slim(Surface):
 
     max_order = 2
     in_pieces = True
+    tells_ends = True
     fit: Fit | None = None
     """How well it fits the points it was made for (`fit_slim`); None: it was made of numbers."""
     of_points: Callable[[Array], tuple[Tensor, ...]] | None = None
@@ -115,6 +117,12 @@ class Slim(Surface):
     def jet(self, points: Tensor, order: int, piece: Tensor | None = None) -> tuple[Tensor, ...]:
         """F, 2 (A y + b) and 2 A of the quadrics numbered by `piece` (...), each for itself."""
         return self._local.jet(points, order, piece)
+
+    def ends(self, points: Tensor, piece: Tensor) -> Tensor:
+        """Distances (..., 1 + K) from balls, as they are now, and cuts of the quadrics numbered by `piece` (...)."""
+        bounds = self._now().local.bounds
+        off = (points.double() - self.centers[piece].double()).norm(dim=-1) - self.radii[piece].double()
+        return torch.cat((off[..., None], plane_distances(points.double(), bounds.planes[piece])), -1)
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
@@ -219,6 +227,9 @@ class Slim(Surface):
         t = hit.blend[:, _T] + (t - t.detach())  # it keeps its bits
         blend = torch.cat((t[:, None], hit.blend[:, _ENDS], sums[:, 2:]), 1)
         return replace(hit, t=t.to(hit.t.dtype), blend=blend)
+
+    def _is_plain(self, origins: Tensor, directions: Tensor, hit: Hits) -> bool:
+        return False  # gradients at hits are blended
 
     def _known(self, origins: Tensor, directions: Tensor, hit: Hits, order: int) -> SurfacePoints:
         """The point is on the ray; gradient and Hessian are means of unit normals and of H / |∇F|."""

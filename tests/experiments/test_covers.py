@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from experiments import covers, quadrics_tables
-from experiments.inverse_slim import Config, CoverProblem, cover
+from experiments.inverse_slim import Config, CoverProblem
 from experiments.quadrics_tables import _brute_force, _incremental, _recentred
 from experiments.report.quadrics_tables import PRINTED_COVERS, PRINTED_RATES, PRINTED_SETS
 from filterlab.surfaces import Quadrics, Spheres, Tetrahedra
@@ -65,26 +65,29 @@ def test_what_is_printed_is_whole():
     assert quadrics_tables.COVERS == "cover"
 
 
-def test_a_few_steps_bring_a_cover_nearer():
+@pytest.mark.parametrize(("unknown", "compared"), [("numbers", "shapes"), ("points", "all")])
+def test_a_few_steps_bring_a_cover_nearer(unknown, compared):
     config = Config.model_validate(
         {
             "experiment": "inverse_slim",
             "description": "a test",
             "target_balls": 800,
             "balls": 150,
-            "views": {"training": 4, "held_out": 1, "size": 20, "shown": 8, "at_once": 1},
-            "descent": {"iterations": 25, "learning_rate": 0.01},
+            "points": 500,
+            "views": {"training": 2, "held_out": 1, "size": 9, "shown": 8, "at_once": 1},
+            "descent": {"iterations": 10, "learning_rate": 0.01},
+            "parts": 1,
+            "weights": {"shapes": {"mask": 0}, "all": {"mask": 1}},
         }
     )
-    problem = CoverProblem.of(config, "depths and normals")
+    problem = CoverProblem.of(config, unknown, compared)
     parameters = {name: x.requires_grad_() for name, x in problem.start().items()}
-    misfit = lambda: float(sum(float(problem.loss(parameters, 0, step)[0].detach()) for step in range(4)))  # noqa: E731
+    misfit = lambda: float(sum(float(problem.loss(parameters, 0, step)[0].detach()) for step in range(2)))  # noqa: E731
     before = misfit()
-    optimiser = torch.optim.Adam(list(parameters.values()), lr=0.01)
-    for step in range(25):
+    optimiser = torch.optim.Adam(list(parameters.values()), lr=0.02)
+    for step in range(10):
         optimiser.zero_grad()
         sum(problem.loss(parameters, 0, step)).backward()
         assert all(bool(x.grad.isfinite().all()) for x in parameters.values())
         optimiser.step()
-    assert misfit() < 0.7 * before
-    assert len(cover(config, parameters)) == len(parameters["c"])
+    assert misfit() < 0.8 * before

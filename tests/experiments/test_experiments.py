@@ -346,6 +346,8 @@ def tiny(name, scan):
     configs["inverse_slim"] = {
         "target_balls": 100,
         "balls": 60,
+        "unknowns": ["numbers", "points"],
+        "points": 150,
         "views": {"training": 2, "held_out": 1, "size": 6, "shown": 8, "at_once": 1},
         "descent": {"iterations": 2, "learning_rate": 0.01},
     }

@@ -463,9 +463,10 @@ class Lanes:
         """`size` bytes."""
         self._intrinsic("llvm.memcpy.p0.p0.i64", ir.VoidType(), [target, source, size, I1(0)])
 
-    def clear(self, target: Value, size: int) -> None:
+    def clear(self, target: Value, size: int | Value) -> None:
         """`size` bytes of zeros."""
-        self._intrinsic("llvm.memset.p0.i64", ir.VoidType(), [target, I8(0), I64(size), I1(0)])
+        size = I64(size) if isinstance(size, int) else size
+        self._intrinsic("llvm.memset.p0.i64", ir.VoidType(), [target, I8(0), size, I1(0)])
 
     def _intrinsic(self, name: str, result: ir.Type, arguments: list[Value]) -> Value:
         """Call one of LLVM's own functions, declared at its first use."""
