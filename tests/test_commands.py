@@ -185,7 +185,8 @@ def test_every_command_shows_its_work(
         def __exit__(self, *_: object) -> None:
             pass
 
-    monkeypatch.setattr(f"filterlab.cli.{command}.progress_bar", lambda quiet=False: Bar())
+    own = {"render": "pictures", "terrain": "pictures"}.get(command, command)
+    monkeypatch.setattr(f"filterlab.cli.{own}.progress_bar", lambda quiet=False: Bar())
     assert main([command, line("resample")[1]] if command == "info" else line(command)) == 0
     parts: dict[str, list[float]] = {}
     for done, what in seen:

@@ -39,6 +39,8 @@ def scene_asked_for(
             called = {"slim": "a SLIM surface", "quadrics": "quadrics"}[key]
             raise ValueError(f"expected no --level, --frame and --channel of {called}; got some: {path}")
         scene = alone_scene(path, key, chosen)
+    elif level is not None and path.suffix.lower() in (".yaml", ".yml"):
+        raise ValueError(f"expected a volume with --level; got a scene, whose level is --surface.level: {path}")
     elif level is not None:
         scene = surface_scene(path, level, chosen)
     elif path.suffix.lower() in (".yaml", ".yml", "") or not path.is_file():

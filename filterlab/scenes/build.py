@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Domain
-from filterlab.io.config import dump_data, load_config, loads_config
+from filterlab.io.config import load_config, loads_data
 from filterlab.recommendation import recommend, report
 from filterlab.render.dvr import Frame, prepare
 from filterlab.render.image import Progress
@@ -95,7 +95,7 @@ def surface_scene(volume: str | os.PathLike[str], level: str, overrides: Mapping
         ConfigError: as `load_scene`.
     """
     content = {"volume": str(volume), "surface": {"level": _number(level), "subpixels": 2}, **_SURFACE}
-    return loads_config(dump_data(content), Scene, overrides, name="--level")
+    return loads_data(content, Scene, overrides, name="--level")
 
 
 def alone_scene(path: str | os.PathLike[str], key: str, overrides: Mapping[str, str] | None = None) -> Scene:
@@ -109,7 +109,7 @@ def alone_scene(path: str | os.PathLike[str], key: str, overrides: Mapping[str, 
         ConfigError: as `load_scene`.
     """
     content = {"surface": {key: str(path), "subpixels": 2}, **_SURFACE, "camera": {"direction": _DIRECTION}}
-    return loads_config(dump_data(content), Scene, overrides, name=str(path))
+    return loads_data(content, Scene, overrides, name=str(path))
 
 
 def terrain_scene(heights: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Scene:
@@ -119,7 +119,7 @@ def terrain_scene(heights: str | os.PathLike[str], overrides: Mapping[str, str] 
         ConfigError: as `load_scene`.
     """
     content = {"terrain": {"heights": str(heights)}, **_TERRAIN}
-    return loads_config(dump_data(content), Scene, overrides, name=str(heights))
+    return loads_data(content, Scene, overrides, name=str(heights))
 
 
 def values_scene(volume: str | os.PathLike[str], overrides: Mapping[str, str]) -> Scene:
@@ -128,7 +128,7 @@ def values_scene(volume: str | os.PathLike[str], overrides: Mapping[str, str]) -
     Raises:
         ConfigError: as `load_scene`.
     """
-    return loads_config(dump_data({"volume": str(volume)}), Scene, overrides, name="the command line")
+    return loads_data({"volume": str(volume)}, Scene, overrides, name="the command line")
 
 
 _DIRECTION = [-0.6, 0.75, -0.5]

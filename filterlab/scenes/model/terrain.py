@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -9,6 +10,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, mo
 
 from filterlab.heights import Heights
 from filterlab.io.heights import format_of, load_heights
+from filterlab.io.heights_header import DegreesWarning
 from filterlab.render import materials, relief
 from filterlab.render.colormaps import HYPSOMETRIC, check_colormap
 from filterlab.render.materials import Coloring
@@ -193,8 +195,11 @@ class TerrainModel(TerrainLook):
         return [self.heights, *(picture for picture in pictures if picture is not None)]
 
     def load(self) -> Heights:
-        """The heights. Raises VolumeFileError for a damaged file."""
-        return load_heights(Path(self.heights), band=self.band)
+        """The heights. Raises VolumeFileError for a damaged file. What the unit says is not warned of."""
+        with warnings.catch_warnings():
+            if self.unit is not None:
+                warnings.simplefilter("ignore", DegreesWarning)
+            return load_heights(Path(self.heights), band=self.band)
 
 
 def one_color(color: str | Rgb) -> Rgb | None:
