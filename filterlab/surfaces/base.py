@@ -335,19 +335,19 @@ class Surface(ABC):
         point = along(origins, directions, t)
         if not len(t) or not self._far_from(origins):
             return point
-        far = origins.detach().abs().amax(-1) > self._near  # t d leads as far, for what is hit is near
+        far = origins.detach().abs().amax(-1) > self._reach  # t d leads as far, for what is hit is near
         own = None if piece is None else piece[far]
         moved = self.detached._nearer(point.detach()[far], directions.detach()[far], own).detach()
         return point.index_add(0, far.nonzero()[:, 0], moved)
 
     @property
-    def _near(self) -> float:
+    def _reach(self) -> float:
         """From the world's origin so far rays begin whose points need not be polished."""
         return _FAR * (self.domain.diagonal + max(map(abs, self.domain.center)))
 
     def _far_from(self, origins: Tensor) -> bool:
         """Whether any of some rays begins farther away."""
-        return max(map(abs, torch.stack(origins.detach().aminmax()).tolist())) > self._near
+        return max(map(abs, torch.stack(origins.detach().aminmax()).tolist())) > self._reach
 
     def _nearer(self, points: Tensor, directions: Tensor, piece: Tensor | None) -> Tensor:
         """By what points (M, 3) come nearer to the surface along rays: steps of Newton's method that lower |F|."""
