@@ -197,6 +197,17 @@ def test_a_field_compiles_whole():
 # ---- the tables themselves
 
 
+@pytest.mark.parametrize("spline", [QSS, CUBIC_C1, QUADRATIC_C1], ids=lambda s: f"degree {s.degree}, {len(s.shapes)}")
+def test_tables_that_were_made_in_inference_mode_serve_autograd(spline):
+    """They are kept for the whole process: whoever asks first must not decide what others may do."""
+    with torch.inference_mode():
+        kept = tetrahedral.Tables.of(spline)
+    moved = kept.to(torch.device("cpu"))
+    tensors = [t for part in vars(moved).values() for t in (part if isinstance(part, tuple) else (part,))]
+    assert kept.masks.is_inference()
+    assert not any(t.is_inference() for t in tensors)
+
+
 def test_shapes_that_do_not_belong_together_are_refused():
     incomplete = Shape(QSS.shapes[0].vertices, dict(list(QSS.shapes[0].masks.items())[1:]))
     with pytest.raises(ValueError, match="expected a mask for every coefficient of degree 2"):

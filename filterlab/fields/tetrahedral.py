@@ -353,16 +353,13 @@ class Tables:
         )
 
     def to(self, device: torch.device) -> Tables:
+        """Copies on a device: of tables that were made in inference mode too, which autograd could not keep."""
+
         def moved(tensors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-            return tuple(t.to(device) for t in tensors)
+            return tuple(t.to(device, copy=True) for t in tensors)
 
         return Tables(
-            self.axes.to(device),
-            self.ranks.to(device),
-            self.pairs.to(device),
-            self.barycentric.to(device),
-            self.masks.to(device),
-            self.rows.to(device),
+            *moved((self.axes, self.ranks, self.pairs, self.barycentric, self.masks, self.rows)),
             moved(self.derivatives),
             moved(self.ahead),
             moved(self.behind),
