@@ -73,7 +73,7 @@ class TransferFunction(Table):
         if not (halves.detach() > 0).all():
             raise ValueError(f"peak widths must be positive; got {(2 * halves).tolist()}")
         x = torch.cat((centers - halves, centers, centers + halves)).sort().values
-        x = x[torch.cat((x.new_ones(1, dtype=torch.bool), x.detach().diff() > _FOOT * float((x[-1] - x[0]).detach())))]
+        x = _distinct(x, float((x[-1] - x[0]).detach()))
         climb = 1 - (x[:, None] - centers).abs() / halves  # (M, peaks)
         shares = torch.where(climb > _FOOT, heights * climb, torch.zeros_like(climb))
         # at a foot every share is 0: the colour is that of the peaks that end there
@@ -115,8 +115,7 @@ class TransferFunction(Table):
         colors = cls(
             torch.linspace(low, high, len(entries), dtype=torch.float64), entries, entries.new_zeros(len(entries))
         )
-        x = torch.cat((colors.positions, ramp.positions)).sort().values
-        x = x[torch.cat((x.new_ones(1, dtype=torch.bool), x.diff() > _FOOT * (high - low)))]
+        x = _distinct(torch.cat((colors.positions, ramp.positions)).sort().values, high - low)
         return cls(x, colors.color(colors.locate(x)), ramp.opacity(ramp.locate(x)), unit)
 
     @classmethod
@@ -164,6 +163,11 @@ class TransferFunction(Table):
         located = function.locate(torch.where(unknown, function.positions[0].detach(), value))
         rgb, alpha = function.color(located), function.opacity(located)
         return torch.where(unknown[..., None], 0, rgb), torch.where(unknown, 0, alpha)
+
+
+def _distinct(x: Tensor, span: float) -> Tensor:
+    """Of ascending positions those that are more than rounding of the span behind the one before."""
+    return x[torch.cat((x.new_ones(1, dtype=torch.bool), x.detach().diff() > _FOOT * span))]
 
 
 def _scalar(value: Numbers | float) -> Tensor:
