@@ -358,13 +358,11 @@ class Tables:
         def moved(tensors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
             return tuple(t.to(device, copy=True) for t in tensors)
 
-        return Tables(
-            *moved((self.axes, self.ranks, self.pairs, self.barycentric, self.masks, self.rows)),
-            moved(self.derivatives),
-            moved(self.ahead),
-            moved(self.behind),
-            moved(self.which),
+        axes, ranks, pairs, barycentric, masks, rows = moved(
+            (self.axes, self.ranks, self.pairs, self.barycentric, self.masks, self.rows)
         )
+        derivatives, ahead, behind, which = map(moved, (self.derivatives, self.ahead, self.behind, self.which))
+        return Tables(axes, ranks, pairs, barycentric, masks, rows, derivatives, ahead, behind, which)
 
 
 def _orders() -> list[tuple[int, int, int]]:
