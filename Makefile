@@ -12,9 +12,10 @@ WORKERS ?= 2
 demo: $(VENV)/.installed
 	$(RUN) -m experiments run configs/demo.yaml
 
-# one thread a worker: the workers already share the cores
+# one thread a worker: the workers already share the cores; what is compiled is kept, also where the environment says
+# otherwise: without, every worker and every process of a test compiles all that it imports
 test: $(VENV)/.installed
-	OMP_NUM_THREADS=1 $(RUN) -m pytest -n $(WORKERS) --dist worksteal
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(RUN) -m pytest -n $(WORKERS) --dist worksteal
 
 check: $(VENV)/.installed-dev
 	$(RUN) -m ruff check .

@@ -155,6 +155,40 @@ def first_call(methods: list[str]) -> dict[str, float]:
     return {method: call(method) for method in methods} | {"again": call(methods[-1])}
 
 
+def torch_compile(threads: int, method: str | None) -> dict[str, float]:
+    """CPU seconds of the first call, and its derivatives, of what torch.compile is given, with all that it starts.
+
+    Given a step that trains an `nn.Reconstruction` by that method; without one, the sum of sines, the least that torch
+    itself takes.
+    """
+    import torch
+
+    torch.set_num_threads(threads)
+    points = 31 * torch.rand(4096, 3)
+    if method is None:
+        samples = torch.rand(32, 32, 32, requires_grad=True)
+        step = torch.compile(lambda: samples.sin().sum(), fullgraph=True)
+    else:
+        from filterlab.nn import Reconstruction
+
+        module = Reconstruction((32, 32, 32), method)
+
+        def loss() -> torch.Tensor:
+            value, gradient = module.value_and_gradient(points)
+            return value.sin().sum() + gradient.square().sum()
+
+        loss().backward()  # machine code is compiled
+        step = torch.compile(loss, fullgraph=True)
+    before = _cpu_with_children()
+    step().backward()
+    return {"seconds": _cpu_with_children() - before}
+
+
+def _cpu_with_children() -> float:
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
 if __name__ == "__main__":
-    probes = {f.__name__: f for f in (memory, casting_memory, steadiness, first_call)}
+    probes = {f.__name__: f for f in (memory, casting_memory, steadiness, first_call, torch_compile)}
     print(json.dumps(probes[sys.argv[1]](**json.loads(sys.argv[2]))))

@@ -158,8 +158,7 @@ def _announce(name: str, description: str, units: list[Unit], left: list[Unit], 
         return
     done = len(units) - len(left)
     kept = f"{done} of {len(units)} units of work are done already; " if done else ""
-    expected = _duration(sum(unit.seconds for unit in left))
-    print(f"{kept}{len(left)} to do, about {expected} on two cores", file=sys.stderr)
+    print(f"{kept}{len(left)} to do; the time left is told as they are done", file=sys.stderr)
 
 
 def _warn_of_other_code(run: Run) -> None:

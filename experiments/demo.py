@@ -6,17 +6,22 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from experiments import dvr_signal, dvr_volume, frequency_response, rms_error, texture_precision
+from experiments import dvr_signal, dvr_volume, frequency_response, rms_error, terrain_views, texture_precision
 from experiments.config import ExperimentConfig, check_device
 from experiments.runs import Record, Run, Unit
 
 PARTS: dict[str, Any] = {
     module.__name__.rpartition(".")[2]: module
-    for module in (frequency_response, rms_error, dvr_signal, dvr_volume, texture_precision)
+    for module in (frequency_response, rms_error, dvr_signal, dvr_volume, texture_precision, terrain_views)
 }
 
 Part = Annotated[
-    frequency_response.Config | rms_error.Config | dvr_signal.Config | dvr_volume.Config | texture_precision.Config,
+    frequency_response.Config
+    | rms_error.Config
+    | dvr_signal.Config
+    | dvr_volume.Config
+    | texture_precision.Config
+    | terrain_views.Config,
     Field(discriminator="experiment"),
 ]
 

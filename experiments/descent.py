@@ -11,7 +11,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Annotated, Protocol
 
@@ -19,7 +19,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from experiments.runs import Record, RunError
+from experiments.runs import Record, Run, RunError
 from filterlab.io.atomic import atomic_write
 from filterlab.io.config import StrictModel
 from filterlab.scenes.model import Positive
@@ -62,6 +62,29 @@ class Problem(Protocol):
     def observe(self, parameters: Parameters, stage: int) -> Record:
         """What is written down of the parameters now and then."""
         ...
+
+
+class OneStage:
+    """A problem of one stage, whose parameters may have any values."""
+
+    def refine(self, parameters: Parameters, stage: int) -> Parameters:
+        raise AssertionError("there is one stage")
+
+    def project(self, parameters: Parameters) -> None:
+        """Nothing: all values are allowed."""
+
+
+class Recorded(Protocol):
+    """Of a config: steps between observations, and between checkpoints; where parameters are."""
+
+    @property
+    def record_every(self) -> int: ...
+
+    @property
+    def checkpoint_every(self) -> int: ...
+
+    @property
+    def device(self) -> str: ...
 
 
 @dataclass
@@ -130,6 +153,29 @@ def minimize(
             _save(state, checkpoint)
         progress(state.iteration / ends[-1])
     return state
+
+
+def descended(
+    problem: Problem, stages: Sequence[Stage], config: Recorded, key: str, run: Run, share: float = 1.0
+) -> State:
+    """`minimize` with its state in a file of a run's, named by a key; all of it is a share of the unit's work."""
+    return minimize(
+        problem,
+        stages,
+        run.folder / "files" / f"{run.prefix}{key}.state.pt".replace("/", "--"),
+        observe_every=config.record_every,
+        checkpoint_every=config.checkpoint_every,
+        device=config.device,
+        progress=lambda fraction: run.advance(share * fraction),
+    )
+
+
+def course(state: State) -> Record:
+    """How a descent went; observations with the mean misfit of the steps since the one before."""
+    ends = [observation["iteration"] for observation in state.observations]
+    means = [None, *(sum(state.misfits[a:b]) / (b - a) for a, b in pairwise(ends))]
+    observations = [{**o, "misfit": m} for o, m in zip(state.observations, means, strict=True)]
+    return {"misfits": state.misfits, "penalties": state.penalties, "observations": observations}
 
 
 def slowing(i: int, n: int) -> float:

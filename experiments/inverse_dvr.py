@@ -9,7 +9,6 @@ that makes a field of the voxels.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import torch
@@ -27,7 +26,7 @@ from experiments.config import (
     number,
     torch_dtype,
 )
-from experiments.descent import Stage, State, minimize
+from experiments.descent import course, descended
 from experiments.dvr_signal import amplified_difference, displayed
 from experiments.recovery import (
     Bench,
@@ -177,34 +176,12 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
     return {"kind": kind, **recipe.record(), "positions": positions, **_transfer(config, problem, unit.key, run)}
 
 
-def _minimized(
-    config: Config, problem: VolumeProblem | TransferProblem, stages: list[Stage], key: str, run: Run
-) -> State:
-    return minimize(
-        problem,
-        stages,
-        run.folder / "files" / f"{run.prefix}{key}.state.pt".replace("/", "--"),
-        observe_every=config.record_every,
-        checkpoint_every=config.checkpoint_every,
-        device=config.device,
-        progress=lambda fraction: run.advance(_DESCENT * fraction),
-    )
-
-
-def _course(state: State) -> Record:
-    """What the report draws of a descent; each observation with the mean misfit of the steps since the one before."""
-    ends = [observation["iteration"] for observation in state.observations]
-    means = [None, *(sum(state.misfits[a:b]) / (b - a) for a, b in pairwise(ends))]
-    observations = [{**o, "misfit": mean} for o, mean in zip(state.observations, means, strict=True)]
-    return {"misfits": state.misfits, "penalties": state.penalties, "observations": observations}
-
-
 # --- records ----------------------------------------------------------------------------------------------------------
 
 
 def _volume(config: Config, problem: VolumeProblem, key: str, run: Run) -> Record:
     assert config.volume is not None
-    state = _minimized(config, problem, list(config.volume.stages), key, run)
+    state = descended(problem, list(config.volume.stages), config, key, run, _DESCENT)
     bench, truth = problem.bench, problem.bench.samples.samples
     first, found = problem.start()["voxels"], state.parameters["voxels"].detach()
     shown = {"target": bench.target, "start": bench.field(first), "result": bench.field(found)}
@@ -214,7 +191,7 @@ def _volume(config: Config, problem: VolumeProblem, key: str, run: Run) -> Recor
     slices = _slices(voxels, dependence, config.views.amplify, key, run)
     array = run.save_array(key, found)
     return {
-        **_course(state),
+        **course(state),
         "samples": problem.observe({"voxels": truth}, state.stage),
         "groups": groups(dependence, found - truth),
         "images": images,
@@ -281,7 +258,7 @@ def files(record: Any) -> list[str]:
 
 def _transfer(config: Config, problem: TransferProblem, key: str, run: Run) -> Record:
     assert config.transfer_function is not None
-    state = _minimized(config, problem, [config.transfer_function], key, run)
+    state = descended(problem, [config.transfer_function], config, key, run, _DESCENT)
     bench = problem.bench
     with torch.no_grad():
         first, found = problem.transfer(problem.start()), problem.transfer(state.parameters)
@@ -290,7 +267,7 @@ def _transfer(config: Config, problem: TransferProblem, key: str, run: Run) -> R
     images = _images(bench, ("held_out",), shown, key, run)
     counts = torch.histc(problem.values.double().cpu(), BINS, problem.low, problem.high)
     return {
-        **_course(state),
+        **course(state),
         "exact": problem.observe_exact(),
         "curves": {name: _curve(t, problem.low, problem.high) for name, t in functions.items()},
         "histogram": {"low": problem.low, "high": problem.high, "shares": (counts / counts.sum()).tolist()},

@@ -20,9 +20,9 @@ from torch import Tensor
 
 from experiments import covers
 from experiments.config import ExperimentConfig
-from experiments.descent import Parameters, Stage, minimize
+from experiments.descent import OneStage, Parameters, Stage, course, descended
 from experiments.inverse_dvr import files
-from experiments.inverse_surface import Images, Views, Weights, compared, course, images_of, misfit, save_views
+from experiments.inverse_surface import Images, Views, Weights, compared, images_of, misfit, save_views
 from experiments.runs import Record, Run, Unit
 from filterlab.render import Camera, Silhouettes
 from filterlab.surfaces import Slim, fit_slim
@@ -132,7 +132,7 @@ def _drawn(config: Config) -> Callable[[Tensor], Tensor]:
 
 
 @dataclass(frozen=True)
-class CoverProblem:
+class CoverProblem(OneStage):
     """min over unknowns of the weighted mean squares of the differences of masks, depths, normals, + penalty."""
 
     config: Config
@@ -157,18 +157,12 @@ class CoverProblem:
     def start(self) -> Parameters:
         return self.unknown.start()
 
-    def refine(self, parameters: Parameters, stage: int) -> Parameters:
-        raise AssertionError("there is one stage")
-
     def loss(self, parameters: Parameters, stage: int, iteration: int) -> tuple[Tensor, Tensor]:
         config, views = self.config, self.config.views.of_step(iteration, self.config.seed)
         edges = {"silhouettes": Silhouettes(config.lines, config.parts), "seed": iteration} if self.weights.mask else {}
         images = _images(config, self.unknown.cover(parameters), [self.training[k] for k in views], **edges)
         penalty = config.keeping * self.unknown.strayed(parameters)
         return misfit(self.weights, images, Images(*(x[views] for x in self.wanted))), penalty
-
-    def project(self, parameters: Parameters) -> None:
-        """Nothing: every number is allowed."""
 
     @torch.no_grad()
     def observe(self, parameters: Parameters, stage: int) -> Record:
@@ -195,14 +189,7 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
     """The record of one recovery."""
     unknown, name = unit.key.split("/", 1)
     problem, key = CoverProblem.of(config, unknown, name), unit.key.replace(" ", "-").replace("/", "--")
-    state = minimize(
-        problem,
-        [config.descent],
-        run.folder / "files" / f"{run.prefix}{key}.state.pt",
-        observe_every=config.record_every,
-        checkpoint_every=config.checkpoint_every,
-        progress=run.advance,
-    )
+    state = descended(problem, [config.descent], config, key, run)
     result = problem.unknown.cover({name: x.detach() for name, x in state.parameters.items()})
     surfaces = {"target": problem.target, "start": problem.unknown.cover(problem.start()), "result": result}
     cameras = {"training": problem.training[0], "held_out": problem.held_out[0]}

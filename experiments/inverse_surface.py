@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
@@ -18,7 +17,7 @@ from torch import Tensor
 
 import filterlab as fl
 from experiments.config import BoundaryName, Dtype, ExperimentConfig, Recipe, number, torch_dtype
-from experiments.descent import Parameters, Stage, State, minimize
+from experiments.descent import OneStage, Parameters, Stage, course, descended
 from experiments.inverse_dvr import files
 from experiments.recovery import directions
 from experiments.runs import Record, Run, Unit
@@ -143,7 +142,7 @@ class Images(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SurfaceProblem:
+class SurfaceProblem(OneStage):
     """min over x of the weighted mean squares of the differences of masks, depths and normals, + penalty(x)."""
 
     config: Config
@@ -172,18 +171,12 @@ class SurfaceProblem:
         distance = _grid(self.config.resolution, self.config).norm(dim=-1)
         return {"voxels": self.config.level + self.config.slope * (self.config.radius - distance)}
 
-    def refine(self, parameters: Parameters, stage: int) -> Parameters:
-        raise AssertionError("there is one stage")
-
     def loss(self, parameters: Parameters, stage: int, iteration: int) -> tuple[Tensor, Tensor]:
         voxels, views = parameters["voxels"], self.config.views.of_step(iteration, self.config.seed)
         cameras = [self.training[k] for k in views]
         images = _images(self.config, _field(voxels, self.config), cameras, self.silhouettes, iteration)
         penalty = self.config.smoothness * bending(voxels)
         return misfit(self.weights, images, Images(*(x[views] for x in self.wanted))), penalty
-
-    def project(self, parameters: Parameters) -> None:
-        """Nothing: every number is allowed."""
 
     @torch.no_grad()
     def observe(self, parameters: Parameters, stage: int) -> Record:
@@ -260,15 +253,7 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
     """The record of one recovery."""
     name, kind = unit.key.rsplit("/", 1)
     problem = SurfaceProblem.of(config, name, kind)
-    state = minimize(
-        problem,
-        [config.descent],
-        run.folder / "files" / f"{run.prefix}{unit.key}.state.pt".replace("/", "--"),
-        observe_every=config.record_every,
-        checkpoint_every=config.checkpoint_every,
-        device=config.device,
-        progress=run.advance,
-    )
+    state = descended(problem, [config.descent], config, unit.key, run)
     found = state.parameters["voxels"].detach()
     shown = {
         "target": problem.target,
@@ -287,14 +272,6 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
         "voxels": array,
         "files": [*files(images), array],
     }
-
-
-def course(state: State) -> Record:
-    """How a descent went; observations with the mean misfit of the steps since the one before."""
-    ends = [observation["iteration"] for observation in state.observations]
-    means = [None, *(sum(state.misfits[a:b]) / (b - a) for a, b in pairwise(ends))]
-    observations = [{**o, "misfit": m} for o, m in zip(state.observations, means, strict=True)]
-    return {"misfits": state.misfits, "penalties": state.penalties, "observations": observations}
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from experiments.config import Dtype, ExperimentConfig, number, torch_dtype
-from experiments.descent import Parameters, Stage, minimize
+from experiments.descent import OneStage, Parameters, Stage, descended
 from experiments.inverse_dvr import files
 from experiments.runs import Record, Run, Unit
 from experiments.terrain_error import franke
@@ -105,7 +105,7 @@ class Images(NamedTuple):
 
 
 @dataclass(frozen=True)
-class HeightProblem:
+class HeightProblem(OneStage):
     """min over h of the weighted mean squares of the differences of depths and shaded images, + penalty(h)."""
 
     config: Config
@@ -130,9 +130,6 @@ class HeightProblem:
         """Flat ground in the middle of the relief."""
         return {"heights": torch.full_like(self.target, 0.5 * self.config.relief)}
 
-    def refine(self, parameters: Parameters, stage: int) -> Parameters:
-        raise AssertionError("there is one stage")
-
     def loss(self, parameters: Parameters, stage: int, iteration: int) -> tuple[Tensor, Tensor]:
         heights, view = parameters["heights"], iteration % len(self.training)
         found = _images(self.config, heights, [self.training[view]])
@@ -146,9 +143,6 @@ class HeightProblem:
         shade = torch.where(both[..., None], found.shade - wanted.shade, 0)
         scaled = depth.square().mean() / self.config.relief**2
         return self.weights.depth * scaled + self.weights.shade * shade.square().mean()
-
-    def project(self, parameters: Parameters) -> None:
-        """Nothing: every height is allowed."""
 
     @torch.no_grad()
     def observe(self, parameters: Parameters, stage: int) -> Record:
@@ -226,15 +220,7 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
     """The record of one recovery."""
     problem = HeightProblem.of(config, unit.key)
     stage = config.descent.model_copy(update={"learning_rate": config.descent.learning_rate * config.relief})
-    state = minimize(
-        problem,
-        [stage],
-        run.folder / "files" / f"{run.prefix}{unit.key}.state.pt".replace("/", "--"),
-        observe_every=config.record_every,
-        checkpoint_every=config.checkpoint_every,
-        device=config.device,
-        progress=run.advance,
-    )
+    state = descended(problem, [stage], config, unit.key, run)
     found = state.parameters["heights"].detach()
     shown = {"target": problem.target, "result": found}
     images = {name: _shown(config, problem, heights, f"{unit.key}-{name}", run) for name, heights in shown.items()}

@@ -94,7 +94,7 @@ class Figure(Sampled):
 
     title: Annotated[str, Field(min_length=1)]
     noise: Annotated[float, Field(ge=0)] = 0.0
-    surface: scene.SurfaceModel
+    surface: scene.LevelSetModel
     methods: Recipes
     marching_cubes: bool = True
     look: Look = Look()
@@ -104,13 +104,10 @@ class Figure(Sampled):
     @property
     def level(self) -> float:
         """The value on the surface."""
-        assert self.surface.level is not None
         return self.surface.level
 
     @model_validator(mode="after")
     def _consistent(self) -> Figure:
-        if self.surface.level is None:
-            raise ValueError("surface.slim: what is compared here are level sets; give a level")
         if self.noise and self.signal is None:
             raise ValueError("noise: it is added to the samples of a signal; a scan has its own, leave it out")
         if self.look.error is not None and self.signal is None:

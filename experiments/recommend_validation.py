@@ -36,6 +36,7 @@ from filterlab.recommendation.calibration import CALIBRATION, FALLS
 from filterlab.recommendation.choice import TASKS, Candidate, Question, Recommendation, choose, errors_of
 from filterlab.recommendation.errors import SURE, MethodErrors, Yardstick
 from filterlab.recommendation.ways import Way, WayCost, costs_of, ways_of
+from filterlab.scenes.model import MethodName
 from filterlab.volume import Boundary, as_volume
 
 Size = Annotated[int, Field(ge=2, le=160)]
@@ -44,7 +45,7 @@ HALVES = ("tuning", "reporting")
 
 _BUDGETS = 1e-4, 0.1
 _AROUND = 4.0  # times the true errors
-_COUNTS, _HELD = 0.05, 0.97  # see `filterlab.recommendation.calibration`
+_COUNTS, _HELD, _LIKELY = 0.05, 0.97, 0.85  # see `filterlab.recommendation.calibration`
 _COSTS_ON = 64  # voxels along an axis
 
 
@@ -56,6 +57,7 @@ class Config(ExperimentConfig):
         sizes: voxels along an axis, least and most, log-uniform; large: those of one volume in `every`.
         scans, pieces: files, and pieces of every one; one in three is not low-passed before it is decimated.
         boundaries, budgets: how many of the five are drawn for a volume, and of budgets for each task.
+        methods: among which it chooses; left out, all.
         points: at which errors are computed.
         seconds: for which costs are measured, once.
     """
@@ -70,6 +72,7 @@ class Config(ExperimentConfig):
     pieces: Annotated[int, Field(ge=1, le=100)] = 6
     boundaries: Annotated[int, Field(ge=1, le=5)] = 2
     budgets: Annotated[int, Field(ge=2, le=20, multiple_of=2)] = 4
+    methods: Annotated[list[MethodName], Field(min_length=2, default_factory=lambda: list(METHODS))]
     points: Annotated[int, Field(ge=100, le=10**6)] = 2**14
     seconds: Annotated[float, Field(gt=0, le=600)] = 20.0
 
@@ -125,7 +128,7 @@ def _subject(config: Config, name: str, k: int, random: np.random.Generator, run
 def _costs(config: Config) -> dict[tuple[Way, int], WayCost]:
     """Of all ways, for jets of order 0 and 1, measured on one volume."""
     volume = fl.signals.marschner_lobb().sample(_COSTS_ON, dtype=torch.float32)
-    ways = [way for method in METHODS.values() for way in ways_of(method, torch.float32, True)]
+    ways = [way for name in config.methods for way in ways_of(METHODS[name], torch.float32, True)]
     return {
         (way, order): cost
         for order in (0, 1)
@@ -181,7 +184,7 @@ def _judged(
 ) -> dict[str, Any]:
     """Estimates and answers under a boundary."""
     yardstick = Yardstick.of(subject.volume[None], None, boundary, config.seed)
-    errors = errors_of(yardstick, list(METHODS), subject.volume.dtype, lambda _: True)
+    errors = errors_of(yardstick, config.methods, subject.volume.dtype, lambda _: True)
     known: dict[tuple[str, str | None], Truth] = {}
     for way in errors:
         if (way[0], way[2]) not in known:  # schemes compute the same field
@@ -276,8 +279,8 @@ def judged(answer: Recommendation, true: Callable[[Candidate], float]) -> dict[s
 # --- calibration ------------------------------------------------------------------------------------------------------
 
 
-def fitted(records: Sequence[Record]) -> dict[str, tuple[list[float], list[float]]]:
-    """c and C of `filterlab.recommendation.calibration`, from the records of the tuning half."""
+def fitted(records: Sequence[Record]) -> dict[str, tuple[list[float], ...]]:
+    """c, C and L of `filterlab.recommendation.calibration`, from the records of the tuning half."""
     tuning = [r for r in records if r["half"] == HALVES[0]]
     return {quantity: _quantiles(_needed(tuning, quantity)) for quantity in CALIBRATION}
 
@@ -304,13 +307,11 @@ def _pairs(found: Mapping[str, Any], quantity: str) -> list[list[Any]]:
     return [way[quantity] for way in found["ways"] if way["storage"] is None]
 
 
-def _quantiles(rows: np.ndarray) -> tuple[list[float], list[float]]:
+def _quantiles(rows: np.ndarray) -> tuple[list[float], ...]:
     """At each of `FALLS`, over what lies between its neighbours; infinite where nothing does."""
     ends = (-math.inf, *FALLS, math.inf)
-    factors: tuple[list[float], list[float]] = ([], [])
-    for i in range(1, len(ends) - 1):
-        near = rows[(rows[:, 0] >= ends[i - 1]) & (rows[:, 0] <= ends[i + 1])]
-        for column, known in enumerate(factors):
-            found = float(np.quantile(near[:, column + 1], _HELD)) if len(near) else math.inf
-            known.append(found)
-    return factors
+    near = [rows[(rows[:, 0] >= low) & (rows[:, 0] <= high), 1:] for low, high in zip(ends[:-2], ends[2:], strict=True)]
+    return tuple(
+        [float(np.quantile(found[:, column], part)) if len(found) else math.inf for found in near]
+        for column, part in ((0, _HELD), (1, _HELD), (1, _LIKELY))
+    )

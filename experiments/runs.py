@@ -53,7 +53,7 @@ class Unit:
     Attributes:
         key: its name, unique within the run; a run that resumes skips the keys it finds.
         label: what the progress bar calls it.
-        seconds: a rough expectation on two cores; only the bar and the announcement use it.
+        seconds: a rough expectation; what is told of the time left weighs units by it, and measures.
     """
 
     key: str

@@ -17,8 +17,10 @@ from filterlab.heights import Heights
 from filterlab.io.config import ConfigError, Problem, StrictModel
 from filterlab.io.heights import describe_heights, load_heights
 from filterlab.notices import Notice
+from filterlab.scenes.build import picture
 from filterlab.scenes.flight import Flight
-from filterlab.scenes.terrain import Terrain, TerrainScene
+from filterlab.scenes.model import Compass, Pixels, Scene, TerrainLook, TerrainModel
+from filterlab.scenes.terrain import COMPASS, VIEW, PreparedTerrain, Terrain
 
 ABSENT = "absent"
 _SECONDS = 6e-6  # of a ray; only expectations use it
@@ -44,12 +46,14 @@ class View(StrictModel):
     """A picture, or several along a flight.
 
     Attributes:
-        scene: what `filterlab terrain` takes.
+        terrain, size: as in a scene. compass: that of its camera.
         flight, frames: a path over the ground, and how many pictures there are of it.
     """
 
     title: Annotated[str, Field(min_length=1)]
-    scene: TerrainScene = TerrainScene(size=(480, 300))
+    terrain: TerrainLook = TerrainLook()
+    compass: Compass = COMPASS
+    size: tuple[Pixels, Pixels] = (480, 300)
     flight: Flight | None = None
     frames: Annotated[int, Field(ge=1, le=100)] = 3
 
@@ -79,6 +83,12 @@ def check(config: Config, path: str = "") -> None:
                 raise ConfigError([Problem(place.title, f"{path}places[{i}].heights", str(error))]) from None
 
 
+def _scene(place: Place, view: View) -> Scene:
+    told = view.terrain.model_dump(mode="json", exclude_unset=True)
+    terrain = TerrainModel(heights=str(place.heights.path()), band=place.heights.band, **told)
+    return Scene(terrain=terrain, camera=VIEW.model_copy(update={"compass": view.compass}), size=view.size)
+
+
 def units(config: Config) -> list[Unit]:
     """One per picture, and one for what is not here."""
     found = []
@@ -87,8 +97,8 @@ def units(config: Config) -> list[Unit]:
             found.append(Unit(f"{i}/{ABSENT}/0", f"{place.title}: not here", 0.01))
             continue
         for j, view in enumerate(place.views):
-            width, height = view.scene.size
-            seconds = _SECONDS * width * height * view.scene.subpixels**2
+            width, height = view.size
+            seconds = _SECONDS * width * height * view.terrain.subpixels**2
             count = 1 if view.flight is None else view.frames
             found += [Unit(f"{i}/{j}/{k}", f"{place.title}, {view.title}", seconds) for k in range(count)]
     return found
@@ -102,12 +112,13 @@ def compute(config: Config, unit: Unit, run: Run) -> Record:
         return {"kind": ABSENT, "place": int(i), "file": place.heights.file}
     view = place.views[int(j)]
     heights = run.memo(f"heights:{i}", place.heights.read)
-    terrain = run.memo(f"terrain:{i}/{j}", lambda: Terrain.of(view.scene, heights))
-    camera = None if view.flight is None else view.flight.cameras(terrain, view.frames)[int(k)]
+    shown = run.memo(
+        f"terrain:{i}/{j}", lambda: PreparedTerrain.of(_scene(place, view), Terrain.of(view.terrain, heights))
+    )
+    terrain = shown.terrain
+    seen = shown if view.flight is None else view.flight.views(shown, view.frames)[int(k)]
     with torch.no_grad():
-        image, seconds = timed(
-            lambda: terrain.render(lambda done, total: run.advance(done / max(total, 1)), camera),
-        )
+        image, seconds = timed(lambda: picture(seen, lambda done, total: run.advance(done / max(total, 1))))
     saved = run.save_image(f"{i}-{j}-{k}", image)
     left, bottom, right, top = terrain.heights.extent
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TypeVar, overload
 
@@ -53,3 +54,10 @@ def as_numbers(
         TypeError, ValueError, OverflowError or RuntimeError, as torch does, for what are no numbers.
     """
     return torch.as_tensor(as_tensor(x), dtype=dtype, device=device)
+
+
+def all_finite(x: Tensor) -> bool:
+    """Whether all numbers are: a finite sum has finite terms; finite terms may have another one."""
+    x = x.detach()
+    total = x.sum(dtype=torch.promote_types(x.dtype, torch.float32))
+    return math.isfinite(float(total)) or bool(x.isfinite().all())

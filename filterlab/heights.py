@@ -115,6 +115,11 @@ class Heights:
         relief = float(np.nanmax(self.samples) - np.nanmin(self.samples))
         return relief > max(right - left, top - bottom)
 
+    @property
+    def height_in_metres(self) -> float:
+        """How many metres the unit of the samples is; 1 where none is declared. Raises ValueError: one not known."""
+        return _metres(self.height_unit)
+
     def in_metres(self) -> Heights:
         """The same with x, y and heights in metres.
 
@@ -133,7 +138,7 @@ class Heights:
             factors = metres_per_degree(middle)
         else:
             factors = (_metres(self.unit),) * 2
-        upward = _metres(self.height_unit)
+        upward = self.height_in_metres
         moved = replace(
             self,
             spacing=tuple(s * f for s, f in zip(self.spacing, factors, strict=True)),

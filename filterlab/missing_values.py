@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from filterlab.arrays import all_finite
 from filterlab.names import NAN_CHOICES
 from filterlab.ops.differentiable.recording import transformed
 
@@ -30,21 +31,14 @@ def resolved(samples: Tensor, choice: str) -> tuple[Tensor, Tensor | None]:
     """
     if choice not in NAN_CHOICES:
         raise ValueError(f"nan must be one of {', '.join(NAN_CHOICES)}; got {choice!r}")
-    if not samples.dtype.is_floating_point or transformed() or _all_finite(samples):
+    if not samples.dtype.is_floating_point or transformed() or all_finite(samples):
         return samples, None
     unknown = ~samples.detach().isfinite()
-    if not bool(unknown.any()):  # finite numbers whose sum is not
-        return samples, None
     if choice == "refuse":
         raise ValueError(_told(samples))
     if bool(unknown.flatten(-3).all(-1).any()):
         raise ValueError("expected at least one finite voxel to fill from; got a volume without any")
     return filled(samples, unknown), unknown if choice == "propagate" else None
-
-
-def _all_finite(samples: Tensor) -> bool:
-    """Whether all samples are finite, for sure: a sum sees NaN and infinities, and may overflow by itself."""
-    return bool(samples.detach().sum(dtype=torch.promote_types(samples.dtype, torch.float32)).isfinite())
 
 
 def _told(samples: Tensor) -> str:

@@ -1,105 +1,65 @@
-"""Where a ray crosses the quartic spline of heights, found independently: every piece sampled, every root kept.
+"""Where rays cross the quartic spline of heights, found independently: every piece cut until its roots are told apart.
 
-Nothing here imports filterlab. Masks are whole numbers over a common denominator, one for each class of coefficients;
-the others follow by the symmetries of the triangle. Planes x = i, y = j and x ± y = k (in cells) cut a ray into pieces;
-on each s − z is a quartic: the one through 5 values of it. `ray_oracle` finds its critical points and, between them,
-its crossings, and says which rays are undecided. Rays are measured from where they enter the domain, found in
-`longdouble`.
+Nothing here imports filterlab. Planes x = i, y = j and x ± y = k (in cells) cut a ray into pieces; on each s − z is a
+quartic, in Bernstein form: the one through 5 values of it. Rays are measured from where they enter the domain, found
+in `longdouble`. All pieces of all rays are halved together, as often as it takes, until a part
 
-Source of the masks: High-quality rendering of quartic spline surfaces on the GPU, figures 6 to 8.
+    is clear       all coefficients lie on one side of 0, by more than `close`
+    or monotone    all differences of neighbouring coefficients have one sign
+
+A row of monotone parts that lead the same way from one side of 0 to the other, by more than `close`, is one crossing,
+which bisection finds. Where rounding decides what there is, the ray is *undecided*: parts that neither holds of, rows
+that begin or end nearer to 0.
 """
 
 from __future__ import annotations
 
-from math import factorial
+from dataclasses import dataclass
+from math import comb, factorial
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
-from tests import ray_oracle
-from tests.ray_oracle import Truth
+from tests import quartic_oracle
+from tests.quartic_oracle import INDICES
 
 NAMES = ("linear", "c0", "c1", "c2", "c2, prefiltered")
-STEPS = {"linear": 1, "c0": 4, "c1": 3, "c2": 1, "c2, prefiltered": 1}
-_DENOMINATORS = {"c0": 36, "c1": 48, "c2": 24}
+STEPS = {name: quartic_oracle.STEPS[name.replace(",", "")] for name in NAMES}
 _MARGIN = 8  # data that are written out beyond the ends
 _NONE = 1e-12  # pieces that are shorter, of the way in the domain, are none
-
 _TOUCHES = 1e-9  # rays that are no longer than this in the domain, of t, are undecided
+_HALVINGS = 40
+_ROUNDING = 1e-14  # of heights of a few units
+_N = 4
 
-_INDICES = [(4 - j - k, j, k) for k in range(5) for j in range(5 - k)]
-
-_CLASSES: dict[str, dict[tuple[int, int, int], str]] = {
-    "c0": {
-        (4, 0, 0): "0 0 36",
-        (3, 1, 0): "0 0 -39, 1 0 144, 2 0 -108, 3 0 48, 4 0 -9",
-        (2, 2, 0): "0 0 26, 1 0 -128, 2 0 240, 3 0 -128, 4 0 26",
-        (2, 1, 1): (
-            "0 0 26, 0 1 -64, 0 2 -24, 0 3 32, 0 4 -9, 1 0 -64, 1 1 288, 1 2 -96, 1 3 16, 2 0 -24, 2 1 -96, 2 2 12, "
-            "3 0 32, 3 1 16, 4 0 -9"
-        ),
-    },
-    "c1": {
-        (4, 0, 0): "0 0 48",
-        (3, 1, 0): (
-            "-3 0 -4, -3 3 -2, -2 0 18, -2 2 9, -1 0 -36, -1 1 -18, 0 -3 -2, 0 -2 9, 0 -1 -18, 0 0 48, 0 1 18, 0 2 -9, "
-            "0 3 2, 1 -1 18, 1 0 36, 2 -2 -9, 2 0 -18, 3 -3 2, 3 0 4"
-        ),
-        (2, 2, 0): (
-            "0 0 16, 0 1 -18, 0 2 -18, 0 3 8, 1 -1 -18, 1 0 -36, 1 1 108, 1 2 -18, 2 -2 -18, 2 -1 108, 2 0 -36, "
-            "2 1 -18, 3 -3 8, 3 -2 -18, 3 -1 -18, 3 0 16"
-        ),
-        (2, 1, 1): (
-            "-3 0 -2, -2 0 9, -1 0 -18, 0 -3 -2, 0 -2 9, 0 -1 -18, 0 0 32, 0 2 -27, 0 3 10, 1 1 108, 1 2 -18, 2 0 -27, "
-            "2 1 -18, 3 0 10"
-        ),
-    },
-    "c2": {
-        (4, 0, 0): "-1 0 2, -1 1 2, 0 -1 2, 0 0 12, 0 1 2, 1 -1 2, 1 0 2",
-        (3, 1, 0): "-1 1 1, 0 -1 1, 0 0 12, 0 1 3, 1 -1 3, 1 0 4",
-        (2, 2, 0): "0 0 8, 0 1 4, 1 -1 4, 1 0 8",
-        (2, 1, 1): "-1 1 1, 0 0 10, 0 1 6, 1 -1 1, 1 0 6",
-    },
-}
+_VALUES = np.array([[comb(_N, i) * x**i * (1 - x) ** (_N - i) for i in range(_N + 1)] for x in np.arange(5) / 4])
+_TO_BERNSTEIN = np.linalg.inv(_VALUES)  # from the values at 0, 1/4, …, 1
+_FACTORS = [factorial(4) // (factorial(i) * factorial(j) * factorial(k)) for i, j, k in INDICES]
 
 
-def masks(name: str) -> list[dict[tuple[int, int], float]]:
-    """Of `_INDICES` in turn, weights of the data at V0 + a (V1 − V0)/m + b (V2 − V0)/m."""
-    name = name.removesuffix(", prefiltered")
-    if name == "linear":
-        return [{(0, 0): i / 4, (1, 0): j / 4, (0, 1): k / 4} for i, j, k in _INDICES]
-    m, found = STEPS[name], []
-    corners = np.array([(0, 0), (m, 0), (0, m)])
-    for index in _INDICES:
-        order = sorted(range(3), key=lambda n: -index[n])
-        origin, first, second = corners[order]
-        own = {}
-        for entry in _CLASSES[name][tuple(sorted(index, reverse=True))].split(", "):
-            a, b, weight = map(int, entry.split())
-            place = origin + (a * (first - origin) + b * (second - origin)) // m
-            own[tuple(place.tolist())] = weight / _DENOMINATORS[name]
-        found.append(own)
-    return found
+@dataclass(frozen=True)
+class Crossings:
+    """Those of rays.
 
+    Attributes:
+        t: (R, K) in order, ∞ behind the last.
+        loose: (R, K) how far rounding may move them: much, where a ray leaves the ground at a slope of 1e-9.
+        undecided: (R,) whether rounding decides what there is.
+    """
 
-def continued(heights: np.ndarray, boundary: str) -> np.ndarray:
-    """With `_MARGIN` and a cell more data on every side."""
-    for axis in range(2):
-        n = heights.shape[axis]
-        place, period = np.arange(-_MARGIN, n + _MARGIN), max(2 * (n - 1), 1)
-        index = {
-            "mirror": np.minimum(place % period, period - place % period) if n > 1 else 0 * place,
-            "reflect": np.minimum(place % (2 * n), 2 * n - 1 - place % (2 * n)),
-            "wrap": place % n,
-            "border": np.clip(place, 0, n - 1),
-            "zeros": np.clip(place, 0, n - 1),
-        }[boundary]
-        heights = np.take(heights, index, axis)
-        if boundary == "zeros":
-            shape = [1, 1]
-            shape[axis] = -1
-            heights = np.where(((place >= 0) & (place < n)).reshape(shape), heights, 0.0)
-    return heights
+    t: np.ndarray
+    loose: np.ndarray
+    undecided: np.ndarray
+
+    @property
+    def first(self) -> np.ndarray:
+        return self.t[:, 0]
+
+    @property
+    def count(self) -> np.ndarray:
+        return (self.t < np.inf).sum(1)
+
+    def chosen(self, which: slice) -> Crossings:
+        return Crossings(self.t[which], self.loose[which], self.undecided[which])
 
 
 class Ground:
@@ -107,17 +67,17 @@ class Ground:
 
     def __init__(self, name: str, heights: np.ndarray, boundary: str = "mirror", diagonal: str = "main") -> None:
         self.steps, self.size, self.mirrored = STEPS[name], heights.shape[::-1], diagonal == "main"
-        data = continued(np.asarray(heights, dtype=np.float64), boundary)
-        if name == "c2, prefiltered":
-            data = _prefiltered(data, self.mirrored)
         self.cells = [max(-(-(n - 1) // self.steps), 1) for n in self.size]
+        data = quartic_oracle.continued(np.asarray(heights, dtype=np.float64), boundary, _MARGIN)
         x, y = np.meshgrid(*(self.steps * np.arange(n) + _MARGIN for n in self.cells))
-        self.triangles = np.stack([self._coefficients(name, data, x, y, up) for up in (True, False)], -2)
+        masks = [quartic_oracle.mask(name.replace(",", ""), alpha) for alpha in INDICES]
+        self.triangles = np.stack([self._coefficients(masks, data, x, y, up) for up in (True, False)], -2)
+        self.low, self.high = self.triangles.min(-1), self.triangles.max(-1)
 
-    def _coefficients(self, name: str, data: np.ndarray, x: np.ndarray, y: np.ndarray, up: bool) -> np.ndarray:
+    def _coefficients(self, masks: list, data: np.ndarray, x: np.ndarray, y: np.ndarray, up: bool) -> np.ndarray:
         """(rows, columns, 15) of one triangle of every cell."""
         m, rows = self.steps, []
-        for mask in masks(name):
+        for mask in masks:
             total = np.zeros(x.shape)
             for (a, b), weight in mask.items():
                 s, t = (a, b) if up else (m - a, m - b)
@@ -129,105 +89,186 @@ class Ground:
     def at(self, points: np.ndarray) -> np.ndarray:
         """s at points (P, 2)."""
         place = np.asarray(points) / self.steps
-        cell = np.clip(np.floor(place).astype(int), 0, np.array(self.cells) - 1)
-        return self.on_pieces(cell, self.is_up(place, cell), place[:, None])[:, 0]
+        return self.on_pieces(*self.piece(place), place[:, None])[:, 0]
 
-    def is_up(self, place: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    def piece(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cells (P, 2) of places (P, 2) in cells, and whether their upper triangles have them."""
+        cell = np.clip(np.floor(place).astype(int), 0, np.array(self.cells) - 1)
         s, t = (place - cell).T
-        return ((1 - s) if self.mirrored else s) + t <= 1
+        return cell, ((1 - s) if self.mirrored else s) + t <= 1
 
     def on_pieces(self, cell: np.ndarray, up: np.ndarray, places: np.ndarray) -> np.ndarray:
         """(P, M): the polynomials of triangles at places (P, M, 2) in cells."""
         s, t = np.moveaxis(places - cell[:, None], -1, 0)
         s = 1 - s if self.mirrored else s
         s, t = (np.where(up[:, None], x, 1 - x) for x in (s, t))
-        c = self.triangles[cell[:, 1], cell[:, 0], np.where(up, 0, 1)]
+        c = self.triangles[cell[:, 1], cell[:, 0], np.where(up, 0, 1)] * _FACTORS
+        powers = [np.stack([x**n for n in range(_N + 1)]) for x in (1 - s - t, s, t)]
         total = np.zeros(s.shape)
-        for n, (i, j, k) in enumerate(_INDICES):
-            factor = factorial(4) // (factorial(i) * factorial(j) * factorial(k))
-            total = total + factor * c[:, n, None] * (1 - s - t) ** i * s**j * t**k
+        for n, (i, j, k) in enumerate(INDICES):
+            total += c[:, n, None] * powers[0][i] * powers[1][j] * powers[2][k]
         return total
 
 
-def _prefiltered(data: np.ndarray, mirrored: bool) -> np.ndarray:
-    """3/2 f − 1/12 Σ of the six neighbours, those along the diagonal included."""
-    side = -1 if mirrored else 1  # V1 − V0 along columns is −1 there
-    around = [(side * a, b) for a, b in ((1, 0), (0, 1), (-1, 1), (-1, 0), (0, -1), (1, -1))]
-    return 1.5 * data - sum(np.roll(data, (-b, -a), (0, 1)) for a, b in around) / 12
-
-
-def crossings(f: Ground, origins: np.ndarray, directions: np.ndarray, close: float = 1e-11) -> list[Truth]:
+def crossings(f: Ground, origins: np.ndarray, directions: np.ndarray, close: float = 1e-11) -> Crossings:
     """Those of rays (R, 3), x and y in steps of the data, with z = s(x, y), over the domain and t ≥ 0."""
     o, d = (np.asarray(x, dtype=np.longdouble) / np.array([f.steps, f.steps, 1]) for x in (origins, directions))
-    line, start, low, high, own = [], [], [], [], []
-    touching = np.zeros(len(o), dtype=bool)
-    for ray in range(len(o)):
-        ends = _ends(f, o[ray], d[ray])
-        touching[ray] = ends is not None and len(ends[1]) == 1
-        if ends is not None and not touching[ray]:
-            t0, cuts = ends
-            line += [ray] * (len(cuts) - 1)
-            start += [t0] * (len(cuts) - 1)
-            low.append(cuts[:-1])
-            high.append(cuts[1:])
-            own.append(o[ray] + t0 * d[ray])
-    if not line:
-        return [Truth(np.zeros(0), 0.0 if own else np.inf) for own in touching]
-    line, low, high = np.array(line), np.concatenate(low), np.concatenate(high)
-    entry = np.repeat(np.array(own), np.unique(line, return_counts=True)[1], 0).astype(np.float64)
-    nodes = chebyshev.chebpts1(5)
-    s = low[:, None] + (high - low)[:, None] * (nodes + 1) / 2
-    way = d[line].astype(np.float64)
-    points = entry[:, None] + s[..., None] * way[:, None]
-    middle = points[:, 2, :2]
-    cell = np.clip(np.floor(middle).astype(int), 0, np.array(f.cells) - 1)
-    values = f.on_pieces(cell, f.is_up(middle, cell), points[..., :2]) - points[..., 2]
-    c = np.linalg.solve(chebyshev.chebvander(nodes, 4), values.T)
-    start = np.array(start)
-    found = _of_pieces(len(o), line, start + low, start + high, c, close)
-    return [Truth(one.t, 0.0) if own else one for own, one in zip(touching, found, strict=True)]
+    near, far = _domain(f, o, d)
+    with np.errstate(invalid="ignore"):
+        touching = np.abs(far - near) <= _TOUCHES * (1 + np.abs(near))
+    line, low, high = _cut(f, o, d, near, np.where(touching, -np.inf, far))
+    entry, way = (o + np.where(near < np.inf, near, 0)[:, None] * d).astype(np.float64), d.astype(np.float64)
+    number, c = _pieces(f, entry[line], way[line], low, high, close)
+    parts = _parted(number, c, close)
+    own, s, loose, undecided = _rows(parts, line, low, high, close, len(o))
+    place, count = _in_rows(own, len(o))
+    t, apart = np.full((2, len(o), count), np.inf)
+    t[own, place], apart[own, place] = (near[own] + s).astype(np.float64), loose
+    return Crossings(t, apart, undecided | touching)
 
 
-def _of_pieces(rays: int, line, low, high, c, close: float) -> list[Truth]:
-    """Pieces over holes are none: what is before and behind them is searched as if it were of two rays."""
-    known = np.isfinite(c).all(0)
-    begins = np.append(True, (line[1:] != line[:-1]) | ~known[:-1])
-    part = np.cumsum(begins) - 1
-    some = known & (np.abs(c[0]) <= np.abs(c[1:]).sum(0) + close)
-    found = ray_oracle.of_pieces(part[-1] + 1, part[some], low[some], high[some], c[:, some], close)
-    every: list[list[Truth]] = [[] for _ in range(rays)]
-    for own, truth in zip(line[begins], found, strict=True):
-        every[own].append(truth)
-    return [
-        Truth(np.concatenate([np.zeros(0), *(p.t for p in own)]), min((p.undecided for p in own), default=np.inf))
-        for own in every
-    ]
+def _domain(f: Ground, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """t (R,) at which rays enter the domain and leave it; near > far of those that miss it."""
+    near, far = np.zeros(len(o), dtype=np.longdouble), np.full(len(o), np.inf, dtype=np.longdouble)
+    box = [(0, max(n - 1, 1) / f.steps) for n in f.size]
+    box.append((np.nanmin(f.low, initial=np.inf) - 1, np.nanmax(f.high, initial=-np.inf) + 1))
+    for axis, (a, b) in enumerate(box):
+        x, v = o[:, axis], d[:, axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            first, last = (a - x) / v, (b - x) / v
+        outside, still = (x < a) | (x > b), v == 0
+        first, last = np.minimum(first, last), np.maximum(first, last)
+        near = np.maximum(near, np.where(still, np.where(outside, np.inf, 0), first))
+        far = np.where(still, far, np.minimum(far, last))
+    return near, far
 
 
-def _ends(f: Ground, o: np.ndarray, d: np.ndarray) -> tuple[np.longdouble, np.ndarray] | None:
-    """t at which a ray enters the domain, and from there on where it is cut; one cut: it hardly touches it."""
-    near, far = np.longdouble(0), np.longdouble(np.inf)
-    low, high = np.nanmin(f.triangles, initial=np.inf) - 1, np.nanmax(f.triangles, initial=-np.inf) + 1
-    for x, v, a, b in zip(o, d, (0, 0, low), (*(max(n - 1, 1) / f.steps for n in f.size), high), strict=True):
-        if v == 0:
-            if not a <= x <= b:
-                return None
-            continue
-        first, last = sorted(((a - x) / v, (b - x) / v))
-        near, far = max(near, first), min(far, last)
-    if abs(far - near) <= _TOUCHES * (1 + abs(near)):
-        return near, np.zeros(1)
-    if near > far:
-        return None
-    o, length = o + near * d, far - near
-    sign = -1 if f.mirrored else 1
-    found = [np.zeros(0, dtype=np.longdouble)]
-    for n in ((1, 0), (0, 1), (sign, 1)):
-        place, speed = n @ o[:2], n @ d[:2]
-        if speed != 0:
-            ends = sorted((place, place + length * speed))
-            found.append((np.arange(np.floor(ends[0]), np.ceil(ends[1]) + 1) - place) / speed)
-    cuts = np.sort(np.concatenate(found))
-    cuts = np.concatenate(([0], cuts[(cuts > 0) & (cuts < length)], [length]))
-    keep = np.append(True, np.diff(cuts) > _NONE * length)
-    return near, cuts[keep].astype(np.float64)
+def _cut(f: Ground, o: np.ndarray, d: np.ndarray, near: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Pieces of rays, in order: whose they are, and from where to where, from where the ray enters the domain."""
+    rays = np.nonzero(near <= far)[0]
+    o, d, length = o[rays] + near[rays, None] * d[rays], d[rays], far[rays] - near[rays]
+    line, s = [np.arange(len(rays))] * 2, [np.zeros_like(length), length]
+    for n in ((1, 0), (0, 1), (-1 if f.mirrored else 1, 1)):
+        place, speed = o[:, :2] @ n, d[:, :2] @ n
+        ends = np.sort([place, place + length * speed], 0)
+        first = np.floor(ends[0]).astype(int)
+        count = np.where(speed == 0, 0, np.ceil(ends[1]).astype(int) - first + 1)
+        own = np.repeat(np.arange(len(rays)), count)
+        plane = first[own] + np.arange(len(own)) - (np.cumsum(count) - count)[own]
+        line.append(own)
+        s.append((plane - place[own]) / speed[own])
+    line, s = np.concatenate(line), np.concatenate(s)
+    keep = (s >= 0) & (s <= length[line])
+    line, s = line[keep], s[keep]
+    order = np.lexsort((s, line))
+    line, s = line[order], s[order]
+    begins = np.append(True, np.diff(line) > 0)
+    keep = begins | (np.diff(s, prepend=0) > _NONE * length[line])
+    line, s = line[keep], s[keep].astype(np.float64)
+    within = line[1:] == line[:-1]
+    return rays[line[:-1][within]], s[:-1][within], s[1:][within]
+
+
+def _pieces(f: Ground, entry, way, low, high, close: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of those that may meet the ground: their numbers, and coefficients of s − z (Q, 5)."""
+    z = entry[:, 2] + np.stack((low, high)) * way[:, 2]
+    middle = entry[:, :2] + ((low + high) / 2)[:, None] * way[:, :2]
+    cell, up = f.piece(middle)
+    triangle = cell[:, 1], cell[:, 0], np.where(up, 0, 1)
+    meets = (z.min(0) <= f.high[triangle] + close) & (z.max(0) >= f.low[triangle] - close)  # not of holes
+    number = np.nonzero(meets)[0]
+    s = low[number, None] + (high - low)[number, None] * np.arange(_N + 1) / _N
+    places = entry[number, None] + s[..., None] * way[number, None]
+    values = f.on_pieces(cell[number], up[number], places[..., :2]) - places[..., 2]
+    return number, values @ _TO_BERNSTEIN.T
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Parts of pieces that are not clear of 0: [start, start + width] of [0, 1] of pieces, with coefficients (Q, 5).
+
+    `rises` is 1 or −1 of monotone ones, else 0.
+    """
+
+    piece: np.ndarray
+    start: np.ndarray
+    width: np.ndarray
+    c: np.ndarray
+    rises: np.ndarray
+
+    def chosen(self, which: np.ndarray) -> _Parts:
+        return _Parts(self.piece[which], self.start[which], self.width[which], self.c[which], self.rises[which])
+
+
+def _parted(piece: np.ndarray, c: np.ndarray, close: float) -> _Parts:
+    """All parts that are left, in order."""
+    start, width, done = np.zeros(len(piece)), np.ones(len(piece)), []
+    for halving in range(_HALVINGS + 1):
+        if halving and not len(piece):
+            break
+        left = ~((c > close).all(1) | (c < -close).all(1))
+        piece, start, width, c = piece[left], start[left], width[left], c[left]
+        steps = np.diff(c, axis=1)
+        rises = (steps > 0).all(1).astype(int) - (steps < 0).all(1)
+        ends = (rises != 0) | (halving == _HALVINGS)
+        done.append(_Parts(piece[ends], start[ends], width[ends], c[ends], rises[ends]))
+        piece, start, width, c = piece[~ends], start[~ends], width[~ends] / 2, c[~ends]
+        piece, start, width = np.tile(piece, 2), np.concatenate((start, start + width)), np.tile(width, 2)
+        c = np.concatenate(_halves(c))
+    every = _Parts(*(np.concatenate([getattr(one, name) for one in done]) for name in _Parts.__dataclass_fields__))
+    return every.chosen(np.lexsort((every.start, every.piece)))
+
+
+def _halves(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    left, right = [c[:, 0]], [c[:, -1]]
+    for _ in range(_N):
+        c = (c[:, 1:] + c[:, :-1]) / 2
+        left.append(c[:, 0])
+        right.append(c[:, -1])
+    return np.stack(left, 1), np.stack(right[::-1], 1)
+
+
+def _rows(parts: _Parts, line, low, high, close: float, rays: int) -> tuple[np.ndarray, ...]:
+    """Whose crossings there are, in order, where, and how loose; and rays (R,) that are undecided."""
+    own, first, last = line[parts.piece], parts.c[:, 0], parts.c[:, -1]
+    ends = parts.start + parts.width
+    follows = parts.piece[1:] == parts.piece[:-1] + np.where(ends[:-1] == 1, 1, 0)
+    follows &= (parts.start[1:] == np.where(ends[:-1] == 1, 0, ends[:-1])) & (own[1:] == own[:-1])
+    joined = follows & (np.abs(last[:-1]) <= close) & (parts.rises[1:] == parts.rises[:-1])
+    begin = np.nonzero(np.append(True, ~joined))[0] if len(own) else np.zeros(0, dtype=int)
+    end = np.append(begin[1:], len(own))[: len(begin)] - 1
+    clear = (np.abs(first[begin]) > close) & (np.abs(last[end]) > close) & (parts.rises[begin] != 0)
+    undecided = np.zeros(rays, dtype=bool)
+    undecided[own[begin[~clear]]] = True
+    crosses = clear & (first[begin] * last[end] < 0)
+    begin, sign = begin[crosses], np.sign(last[end[crosses]])
+    while (on := parts.c[begin, -1] * sign <= 0).any():  # the part in which it does
+        begin = begin + on
+    found = parts.chosen(begin)
+    within = _bisected(found.c, sign)
+    length = (high - low)[found.piece]
+    loose = _ROUNDING * found.width * length / np.abs(_slope(found.c, within))
+    return own[begin], low[found.piece] + length * (found.start + found.width * within), loose, undecided
+
+
+def _slope(c: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Of polynomials (Q, 5) at x (Q,)."""
+    return _N * sum(comb(3, i) * own * x**i * (1 - x) ** (3 - i) for i, own in enumerate(np.diff(c, axis=1).T))
+
+
+def _bisected(c: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """Where polynomials (Q, 5) that end with the sign, and are monotone, get it."""
+    a, b = np.zeros(len(c)), np.ones(len(c))
+    c = c * [comb(_N, i) for i in range(_N + 1)] * sign[:, None]
+    for _ in range(50):
+        x = (a + b) / 2
+        y = 1 - x
+        value = (((c[:, 4] * x + c[:, 3] * y) * x + c[:, 2] * y**2) * x + c[:, 1] * y**3) * x + c[:, 0] * y**4
+        a, b = np.where(value > 0, a, x), np.where(value > 0, x, b)
+    return (a + b) / 2
+
+
+def _in_rows(own: np.ndarray, rays: int) -> tuple[np.ndarray, int]:
+    """Which crossing of its ray each is, of rays in order, and how many there are at most, 1 at least."""
+    count = np.bincount(own, minlength=rays)
+    return np.arange(len(own)) - (np.cumsum(count) - count)[own], max(int(count.max(initial=0)), 1)

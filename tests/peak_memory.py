@@ -32,9 +32,9 @@ def highest() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def volume(dtype: torch.dtype, shape: tuple[int, ...] = N) -> Volume:
-    """Numbers, or labels in slabs."""
-    samples = (torch.arange(np.prod(shape)) // 17 % 90).reshape(shape)
+def volume(dtype: torch.dtype, shape: tuple[int, ...] = N, different: int = 90) -> Volume:
+    """So many different numbers, or labels in slabs."""
+    samples = (torch.arange(np.prod(shape)) // 17 % different).reshape(shape)
     return Volume(samples.to(dtype))
 
 
@@ -77,7 +77,7 @@ def cases() -> dict[str, tuple[Volume, dict]]:
         "NaN propagated": (incomplete(), to(nan="propagate")),
         "nearest uint8": (volume(torch.uint8), to(method="nearest")),
         "nearest int64": (volume(torch.int64), to(method="nearest")),
-        "labels": (volume(torch.uint8), to(method="triquadratic", labels=True)),
+        "labels": (volume(torch.uint8, different=12), to(method="triquadratic", labels=True)),
         "turned": (samples, onto(TURNED, boundary="wrap")),
         "turned and filled": (volume(torch.uint8), onto(TURNED, "trilinear", fill=0.0)),
         "turned, nearest": (volume(torch.uint8), onto(TURNED, "nearest")),

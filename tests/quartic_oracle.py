@@ -80,18 +80,22 @@ def prefilter(spline: str) -> dict[tuple[int, int], float]:
     return {(0, 0): 1.5} | dict.fromkeys(RING, -1 / 12) if spline == "c2 prefiltered" else {(0, 0): 1.0}
 
 
+def continued(heights: np.ndarray, boundary: str, more: int) -> np.ndarray:
+    """With so many more data on every side."""
+    for axis, n in enumerate(heights.shape):
+        mode = "edge" if n == 1 and boundary == "mirror" else PADS[boundary]
+        heights = np.pad(heights, [(more, more) if k == axis else (0, 0) for k in range(2)], mode=mode)  # type: ignore
+    return heights
+
+
 class Oracle:
     """s(x, y) of heights (H, W), datum (column, row) at origin + spacing · (column, row)."""
 
     def __init__(self, heights, spline, spacing=(1.0, 1.0), origin=(0.0, 0.0), boundary="mirror", diagonal="main"):
         self.m, self.spacing, self.origin, self.main = STEPS[spline], spacing, origin, diagonal == "main"
         self.pad = 12 * self.m + 12
-        data = np.asarray(heights, dtype=np.float64)
-        modes = [PADS[boundary] if n > 1 or boundary != "mirror" else "edge" for n in data.shape]
-        for axis, mode in enumerate(modes):
-            widths = [(self.pad, self.pad) if k == axis else (0, 0) for k in range(2)]
-            data = np.pad(data, widths, mode=mode)  # type: ignore[call-overload]
-        self.data, self.masks = data, [mask(spline, alpha) for alpha in INDICES]
+        self.data = continued(np.asarray(heights, dtype=np.float64), boundary, self.pad)
+        self.masks = [mask(spline, alpha) for alpha in INDICES]
 
     def corners(self, cell, up):
         """Of a triangle in columns and rows of data."""

@@ -31,6 +31,8 @@ from filterlab.render import (
 from filterlab.signals import SIGNALS
 from filterlab.surfaces import LevelSet, mesh
 from filterlab.volume import Boundary, Volume
+from tests.pairs import covering
+from tests.test_methods import kind_of
 from tests.test_volume import rotated
 
 FAR = (5e5, 4e6, 120.0)
@@ -208,6 +210,11 @@ def triangles() -> Sequence[Tensor]:
     return [made.vertices, made.faces, made.normals]
 
 
+EVALUATIONS = covering(
+    ((m, s) for m, method in METHODS.items() for s in method.schemes), lambda m, s: (m, (kind_of(m), s))
+)
+KINDS = ("trilinear", "ncrsi", "tricubic", "quadratic-c1")
+
 CASES: dict[str, Case] = {
     "geometry": geometry,
     "cameras": cameras,
@@ -220,12 +227,12 @@ CASES: dict[str, Case] = {
         fl.spectrum.measured_response("notch", random(4)),
     ],
     **{f"prefilter-{b}-{i}": partial(prefilters, b, i) for b in Boundary for i in ("reference", "cpu")},
-    **{f"jets-{m}-{s}": partial(jets, m, s) for m, method in METHODS.items() for s in method.schemes},
-    **{f"jvp-{m}": partial(moved_points, m) for m in METHODS},
+    **{f"jets-{m}-{s}": partial(jets, m, s) for m, s in EVALUATIONS},
+    **{f"jvp-{m}": partial(moved_points, m) for m in KINDS},
     **{f"resample-{m}": partial(resampled, m) for m in METHODS},
     **{f"signal-{name}": partial(signal, name) for name in SIGNALS},
     **{f"image-{m}-{s}": partial(images, m, s) for m in ("triquadratic", "qss") for s in ("direct", "fused")},
-    **{f"surface-{m}-phong": partial(surfaces, m, "phong") for m in METHODS if METHODS[m].facts.continuity >= 0},
+    **{f"surface-{m}-phong": partial(surfaces, m, "phong") for m in KINDS},
     **{f"surface-triquadratic-{material}": partial(surfaces, "triquadratic", material) for material in MATERIALS},
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -137,8 +138,7 @@ TAKEN: dict[str, tuple[np.ndarray, Callable[[Any], Any]]] = {
 }
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("name", TAKEN)
+@pytest.mark.parametrize(("name", "dtype"), list(zip(TAKEN, cycle((np.float64, np.float32)), strict=False)))
 def test_an_array_gives_what_a_tensor_gives(name: str, dtype: type) -> None:
     array, call = TAKEN[name]
     own = array.astype(dtype)

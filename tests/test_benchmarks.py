@@ -342,7 +342,8 @@ def test_peers_are_asked_only_for_what_they_have():
 # --- every item, tiny ---
 
 PROCESSES = {
-    "startup/triquadratic-first", "startup/tricubic-first", "dvr/memory", "surfaces/memory", "steadiness/renders",
+    "startup/triquadratic-first", "startup/tricubic-first", "startup/torch.compile", "dvr/memory", "surfaces/memory",
+    "steadiness/renders",
 }  # fmt: skip
 EVERY = [
     (f"{comparison.name}/{item.name}", item) for comparison in COMPARISONS.values() for item in comparison.items(TINY)
@@ -391,6 +392,16 @@ def test_probes_measure_in_this_process_too():
     calls = probe.first_call(["trilinear", "triquadratic"])
     assert set(calls) == {"trilinear", "triquadratic", "again"}
     assert min(calls.values()) > 0
+
+
+def test_what_torch_compile_is_given_runs(monkeypatch):
+    asked = []
+    monkeypatch.setattr(torch, "compile", lambda step, fullgraph: asked.append(step) or step)
+    for method in ("triquadratic", None):
+        assert probe.torch_compile(threads=1, method=method)["seconds"] >= 0
+        with pytest.raises(RuntimeError, match="does not require grad"), torch.no_grad():
+            asked[-1]().backward()
+        assert asked[-1]().requires_grad
 
 
 def test_a_probe_runs_in_a_process_of_its_own(tmp_path):

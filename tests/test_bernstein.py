@@ -192,7 +192,7 @@ def test_everything_is_differentiable_twice(dimension, degree):
         return along, bernstein.evaluate(slope, end)
 
     assert torch.autograd.gradcheck(all_of_it, (coefficients, start, end))
-    assert torch.autograd.gradgradcheck(all_of_it, (coefficients, start, end))
+    assert torch.autograd.gradgradcheck(all_of_it, (coefficients, start, end), fast_mode=dimension > 1)
 
 
 def test_float32_stays_float32_and_axes_broadcast():

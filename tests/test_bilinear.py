@@ -281,7 +281,7 @@ def test_derivatives_in_vertices_and_rays(height):
     hit = [given[0], *(x.detach()[:1].requires_grad_() for x in given[1:])]
     assert torch.autograd.gradcheck(t, given)
     assert torch.autograd.gradcheck(shown, hit)
-    assert torch.autograd.gradgradcheck(lambda *x: t(*x)[0], given)
+    assert torch.autograd.gradgradcheck(lambda *x: t(*x)[0], given, fast_mode=height == 0)
     if height:
         assert torch.autograd.gradgradcheck(lambda x: shown(x, o[:1], d[:1])[1][0, 0], given[:1])
 

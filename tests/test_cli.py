@@ -117,7 +117,8 @@ import sys
 from filterlab.cli import main
 codes = [main(asked) for asked in {asked!r}]
 assert codes == [0, 0, 2, 1, 1, 0, 1], codes
-slow = {{"torch", "pydantic", "yaml", "typeguard", "scipy", "skimage", "matplotlib", "tifffile", "nibabel"}}
+slow = {{"torch", "pydantic", "yaml", "typeguard", "scipy", "skimage", "matplotlib", "tifffile", "nibabel", "rich"}}
+slow |= {{"filterlab.io.nifti", "filterlab.io.tiff_pages", "filterlab.io.geotiff", "filterlab.io.numpy_files"}}
 assert not slow & set(sys.modules), slow & set(sys.modules)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

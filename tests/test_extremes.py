@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations
 from operator import attrgetter
 
 import pytest
 
 from experiments.extremes import CASES, document
 from experiments.extremes.contract import Case, Finding, Subject, Tally, random_numbers
+from tests.pairs import covering
 
 
-def in_pairs(subjects: list[Subject]) -> list[Subject]:
-    """Some of a sweep, with every pair of its methods, schemes and boundaries; `stability` sweeps them all."""
-    schemes: dict[str, list[str]] = {}
-    for s in subjects:
-        schemes.setdefault(s.method, list(dict.fromkeys(o.scheme for o in subjects if o.method == s.method)))
-    methods, boundaries = list(schemes), list(dict.fromkeys(s.boundary for s in subjects))
-
-    def turn(s: Subject) -> str:
-        offered = schemes[s.method]
-        return offered[(methods.index(s.method) + boundaries.index(s.boundary)) % len(offered)]
-
-    return [s for s in subjects if s.scheme == turn(s)] if len(boundaries) > 1 else subjects
+def met(case: Case, subject: Subject) -> tuple[object, ...]:
+    """What meets here: cases meet every method, and every scheme with every boundary; so do, in one case or another,
+    methods. `stability` sweeps all of them together.
+    """
+    evaluation = subject.scheme, subject.boundary, subject.device
+    return (case.key, subject.method), (case.key, *evaluation), *((subject.method, part) for part in evaluation)
 
 
-BY_CASE = [(case, subject) for case in CASES.values() for subject in in_pairs(case.subjects())]
+BY_CASE = covering(((case, subject) for case in CASES.values() for subject in case.subjects()), met)
 
 
 @pytest.mark.parametrize(("case", "subject"), BY_CASE, ids=[f"{case.key}-{subject.key}" for case, subject in BY_CASE])
@@ -87,12 +81,16 @@ def test_a_sweep_leaves_out_what_a_method_does_not_offer() -> None:
     assert Case("y", "", "", lambda *_: Finding(1, 0, 0)).subjects() == [Subject()]
 
 
-def test_every_pair_of_a_sweep_is_tested() -> None:
+def test_every_case_meets_all_that_it_sweeps() -> None:
     for case in CASES.values():
-        every, some = case.subjects(), in_pairs(case.subjects())
-        for parts in combinations(("method", "scheme", "boundary", "device"), 2):
-            pair = attrgetter(*parts)
-            assert set(map(pair, some)) == set(map(pair, every)), (case.key, parts)
+        every, some = case.subjects(), [subject for own, subject in BY_CASE if own is case]
+        for parts in (("method",), ("scheme", "boundary"), ("device",)):
+            values = attrgetter(*parts)
+            assert set(map(values, some)) == set(map(values, every)), (case.key, parts)
+    for parts in (("method", "scheme"), ("method", "boundary")):
+        values = attrgetter(*parts)
+        swept = {values(subject) for case in CASES.values() for subject in case.subjects()}
+        assert {values(subject) for _, subject in BY_CASE} == swept
 
 
 # --- the documentation ------------------------------------------------------------------------------------------------

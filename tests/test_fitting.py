@@ -130,11 +130,8 @@ def test_where_it_lies_and_how_large_it_is_changes_nothing():
 
 
 def test_the_same_points_give_the_same_cover():
-    one, other = (fit_slim(torus(1500), tolerance=1e-3) for _ in range(2))
-    tensor = fit_slim(torch.from_numpy(torus(1500)), tolerance=1e-3)
-    for a, b, c in zip(one.tensors, other.tensors, tensor.tensors, strict=True):
-        assert torch.equal(a, b)
-        assert torch.equal(a, c)
+    array, tensor = (fit_slim(points, tolerance=1e-3) for points in (torus(1500), torch.from_numpy(torus(1500))))
+    assert all(torch.equal(a, b) for a, b in zip(array.tensors, tensor.tensors, strict=True))
 
 
 # --- what scans are like ----------------------------------------------------------------------------------------------

@@ -13,7 +13,8 @@ from filterlab.kernels import KERNELS, bc
 from filterlab.methods import METHODS, reconstruct
 from filterlab.volume import Boundary, Volume
 from tests import laws
-from tests.test_methods import every_way, ways
+from tests.pairs import covering
+from tests.test_methods import every_way, every_way_and_boundary, in_ways, kind_of, ways
 from tests.test_volume import rotated
 
 every_method = pytest.mark.parametrize("method", METHODS)
@@ -40,8 +41,7 @@ def off_knots(*lead: int, shape: tuple[int, ...] = SHAPE, seed: int = 1) -> torc
 # ---- analytic, automatic and finite differences
 
 
-@every_way
-@every_boundary
+@every_way_and_boundary
 def test_analytic_derivatives_equal_autograd_and_finite_differences(method, scheme, gradient, prefilter, boundary):
     field = reconstruct(volume(), method, boundary=boundary, prefilter=prefilter, scheme=scheme, gradient=gradient)
     points = off_knots(25).requires_grad_()
@@ -59,18 +59,13 @@ def test_analytic_derivatives_equal_autograd_and_finite_differences(method, sche
         laws.assert_close(jet[2], jet[2].mT, 1e-13)
 
 
-def one_boundary_each() -> list[tuple[str, str, str, bool, str]]:
-    """Every way of evaluating, the boundaries in turn: numerical differentiation of all pairs would take minutes."""
-    chosen = [way for way in ways() if way[1] == "direct" or way[3]]  # trilinear samples: with the prefilter only
-    return [(*way, str(list(Boundary)[i % len(Boundary)])) for i, way in enumerate(chosen)]
-
-
-every_way_with_a_boundary = pytest.mark.parametrize(
-    ("method", "scheme", "gradient", "prefilter", "boundary"), one_boundary_each()
+@pytest.mark.parametrize(
+    ("method", "scheme", "gradient", "prefilter", "boundary"),
+    covering(
+        ((*way, boundary) for way in ways() for boundary in Boundary),
+        lambda m, s, g, p, b: (m, (kind_of(m), s, g), (s, p), (s, b), (m, s == "sampled")),
+    ),
 )
-
-
-@every_way_with_a_boundary
 def test_gradcheck_and_gradgradcheck_in_volume_and_points(method, scheme, gradient, prefilter, boundary):
     """Default tolerances; second derivatives along random directions, in `test_gradcheck_of_a_batch` each of them."""
     options = {"boundary": boundary, "scheme": scheme, "gradient": gradient, "prefilter": prefilter}
@@ -105,7 +100,7 @@ def test_kernels_can_be_fitted():
     b, c = (torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (0.4, 0.25))
     samples, points = volume(2, 1, 2).requires_grad_(), off_knots(1, shape=(2, 1, 2)).requires_grad_()
     assert torch.autograd.gradcheck(function, (b, c, samples, points))
-    assert torch.autograd.gradgradcheck(lambda *a: laws.mixed(*function(*a)), (b, c, samples, points))
+    assert torch.autograd.gradgradcheck(lambda *a: laws.mixed(*function(*a)), (b, c, samples, points), fast_mode=True)
     exact = reconstruct(samples, KERNELS["mitchell"], prefilter=False).jet(points, 2)
     third = torch.tensor(1 / 3, dtype=torch.float64)
     for actual, expected in zip(function(third, third, samples, points), exact, strict=True):
@@ -163,8 +158,9 @@ def test_vmap_over_a_batched_field_and_nested(method):
         laws.assert_close(grid[i, j], expected, 1e-13)
 
 
-@every_way
-@pytest.mark.parametrize("boundary", ["mirror", "border"])
+@pytest.mark.parametrize(
+    ("method", "scheme", "gradient", "prefilter", "boundary"), in_ways((Boundary.MIRROR, Boundary.BORDER))
+)
 def test_forward_mode_equals_differences(method, scheme, gradient, prefilter, boundary):
     options = {"boundary": boundary, "scheme": scheme, "gradient": gradient, "prefilter": prefilter}
 
@@ -222,7 +218,7 @@ def test_gradcheck_of_splat():
         return ops.splat(g, p, KERNELS["bspline2"], 1, (3, 4, 3))
 
     assert torch.autograd.gradcheck(function, (cotangents, points), check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(function, (cotangents, points))
+    assert torch.autograd.gradgradcheck(function, (cotangents, points), fast_mode=True)
 
 
 def test_a_different_kernel_along_each_axis():
@@ -258,8 +254,13 @@ def squared_values(method: str, samples: torch.Tensor, points: torch.Tensor) -> 
     return torch.autograd.grad(reconstruct(leaf, method)(points).square().sum(), leaf)[0]
 
 
-@every_method
-@pytest.mark.parametrize("storage", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("method", "storage"),
+    covering(
+        product(METHODS, (torch.float32, torch.float64, torch.float16, torch.bfloat16)),
+        lambda m, s: (m, (kind_of(m), s)),
+    ),
+)
 def test_gradients_reach_a_volume_of_any_floating_type(method, storage):
     """Those of numbers a few roundings off (8; the worst of 8 seeds took 4.5), rounded once more as they are kept."""
     points, stored = off_knots(30), volume().to(storage)

@@ -11,7 +11,7 @@ import torch
 from filterlab.ops.differentiable import height_hits as ops
 from filterlab.surfaces import HeightField
 from tests import laws
-from tests.height_ray_oracle import NAMES, STEPS, Ground, crossings, masks
+from tests.height_ray_oracle import NAMES, STEPS, Ground, crossings
 from tests.height_rays import BOUNDARIES, CLASSES, FAULTS, campaign, case_of, one, random
 
 F64 = torch.float64
@@ -29,30 +29,22 @@ def turn(name: str, kind: str) -> tuple[str, str, int]:
 
 
 @every_spline
-def test_masks_of_the_oracle_add_up_and_keep_what_is_linear(name):
-    m = STEPS[name]
-    points = [(j / 4, k / 4) for k in range(5) for j in range(5 - k)]
-    for (x, y), mask in zip(points, masks(name), strict=True):
-        moments = [sum(w * a**p * b**q for (a, b), w in mask.items()) for p, q in ((0, 0), (1, 0), (0, 1))]
-        laws.assert_close(np.array(moments), np.array([1, m * x, m * y]), 1e-13)
-
-
-@every_spline
 def test_crossings_of_the_oracle_are_those_that_a_scan_sees(name):
     case, rng = case_of(name, "random", "mirror", "main", 3)
     o, d = random(rng, case, 20)
     seen = 0
-    for own_o, own_d, truth in zip(o, d, crossings(case.ground, o, d), strict=True):
+    for own_o, own_d, crossed in zip(o, d, crossings(case.ground, o, d).t, strict=True):
+        crossed = crossed[crossed < np.inf]
         ends = np.sort(np.stack([-own_o / own_d, (np.append(case.span, 0) - own_o) / own_d])[:, :2], 0)
         near, far = max(ends[0].max(), 0), ends[1].min()
         if near >= far:
-            assert len(truth.t) == 0
+            assert len(crossed) == 0
             continue
         t = np.linspace(near, far, 800)[1:-1]
         points = own_o + t[:, None] * own_d
         above = points[:, 2] > case.ground.at(points[:, :2])
-        assert ((np.histogram(truth.t, t)[0] % 2 == 1) == (above[1:] ^ above[:-1])).all()
-        seen += len(truth.t)
+        assert ((np.histogram(crossed, t)[0] % 2 == 1) == (above[1:] ^ above[:-1])).all()
+        seen += len(crossed)
     assert seen > 10
 
 
@@ -242,5 +234,6 @@ def test_verdicts_see_a_surface_that_is_off():
     truth = crossings(Ground("c1", case.heights, "mirror", "main"), *rays)
     other = replace(case, heights=case.heights + 0.01).surface
     t = other.hit(*map(torch.from_numpy, rays)).t.numpy()
-    wrong = [abs(a - one.t[0]) > 1e-6 for a, one in zip(t, truth, strict=True) if len(one.t) and np.isfinite(a)]
-    assert sum(wrong) > 0.9 * len(wrong) > 10
+    both = (truth.first < np.inf) & np.isfinite(t)
+    wrong = np.abs(t - truth.first)[both] > 1e-6
+    assert wrong.sum() > 0.9 * len(wrong) > 10

@@ -116,7 +116,9 @@ def test_it_can_be_recommended() -> None:
     assert isinstance(only.field(volume), Turned)
 
 
-def test_commands(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands(tmp_path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(fl.recommend.__kwdefaults__, "seconds", 0.02)
+    monkeypatch.setattr("filterlab.recommendation.choice.METHODS", {NAME: METHODS[NAME], "qss": METHODS["qss"]})
     assert main(["methods"]) == 0
     assert NAME in capsys.readouterr().out
     path = tmp_path / "volume.nrrd"

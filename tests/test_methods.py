@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
 from itertools import product
 
@@ -14,6 +15,7 @@ from filterlab.kernels import KERNELS
 from filterlab.methods import METHODS, Method, named, reconstruct, tensor_product
 from filterlab.volume import Boundary, Volume
 from tests import laws, oracles
+from tests.pairs import covering, in_pairs
 
 SHAPES = ((5, 7, 6), (1, 2, 3), (4, 3, 1), (2, 1, 9))
 TENSOR_PRODUCTS = tuple(name for name in METHODS if tensor_product(name))
@@ -55,9 +57,29 @@ def ways() -> list[tuple[str, str, str, bool]]:
 every_way = pytest.mark.parametrize(("method", "scheme", "gradient", "prefilter"), ways())
 
 
-@every_way
-@every_boundary
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
+def in_ways(*more: Iterable[object]) -> list[tuple]:
+    """(method, scheme, gradient, prefilter, …): all pairs of a method with or without prefilter, a scheme with its
+    gradient, and each of `more`."""
+    every = (((m, p), (s, g), *rest) for m, s, g, p in ways() for rest in product(*more))
+    return [(m, s, g, p, *rest) for (m, p), (s, g), *rest in in_pairs(every)]
+
+
+every_way_and_boundary = pytest.mark.parametrize(
+    ("method", "scheme", "gradient", "prefilter", "boundary"), in_ways(Boundary)
+)
+
+
+def kind_of(method: str) -> str:
+    """Programs of a kind are put together alike: what goes into them is met by the kind, not by each of its methods."""
+    if method not in TENSOR_PRODUCTS:
+        return "tetrahedra"
+    return "terms" if method == "ncrsi" else "tensor product"
+
+
+@pytest.mark.parametrize(
+    ("method", "scheme", "gradient", "prefilter", "boundary", "dtype"),
+    in_ways(Boundary, (torch.float64, torch.float32)),
+)
 def test_equals_the_direct_sum_of_the_oracle(method, scheme, gradient, prefilter, boundary, dtype):
     """Value, gradient and, where offered, Hessian; ≤ 1e-12 of the range in float64, ≤ 5e-6 in float32."""
     tolerance = 1e-12 if dtype == torch.float64 else 5e-6
@@ -84,8 +106,7 @@ def test_the_direct_sum_keeps_its_digits_on_long_axes_in_float32(method):
         laws.assert_close(actual, expected, 5e-6, 2.0)
 
 
-@every_way
-@every_boundary
+@every_way_and_boundary
 def test_the_ends_of_the_box_and_of_a_period_are_right(method, scheme, gradient, prefilter, boundary):
     """Exactly on the first and last voxel, on the faces and on the turning points, where points are folded."""
     for shape in ((2, 3, 4), (1, 5, 2)):
@@ -114,11 +135,12 @@ def test_the_jets_of_lower_order_are_the_first_parts_of_the_higher(method, schem
         laws.assert_close(actual, expected, 1e-13)
 
 
-@every_boundary
-@pytest.mark.parametrize("prefilter", [True, False])
-@every_method
-def test_interpolating_methods_return_every_sample_and_the_others_do_not(method, boundary, prefilter):
-    """n = 1 … 7 and 32 along each axis, first and last sample included, float64 and float32."""
+@pytest.mark.parametrize(
+    ("method", "prefilter", "boundary", "dtype"),
+    in_pairs(product(METHODS, (True, False), Boundary, (torch.float64, torch.float32))),
+)
+def test_interpolating_methods_return_every_sample_and_the_others_do_not(method, prefilter, boundary, dtype):
+    """n = 1 … 7 and 32 along each axis, first and last sample included."""
     facts = METHODS[method].facts
     interpolating = facts.interpolating if prefilter else facts.interpolating_without_prefilter
     for n in (1, 2, 3, 4, 5, 6, 7, 32):
@@ -127,12 +149,11 @@ def test_interpolating_methods_return_every_sample_and_the_others_do_not(method,
             f = torch.as_tensor(samples_of(shape, seed=n))
             z, y, x = np.indices(shape)
             points = torch.as_tensor(np.stack([x, y, z], -1).astype(float))
-            for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 5e-6)):
-                field = reconstruct(f.to(dtype), method, boundary=boundary, prefilter=prefilter)
-                if interpolating:
-                    laws.assert_close(field(points.to(dtype)), f, tolerance, 2.0)
-                else:
-                    assert float((field(points.to(dtype)) - f).abs().max()) > 1e-3
+            field = reconstruct(f.to(dtype), method, boundary=boundary, prefilter=prefilter)
+            if interpolating:
+                laws.assert_close(field(points.to(dtype)), f, 1e-12 if dtype == torch.float64 else 5e-6, 2.0)
+            else:
+                assert float((field(points.to(dtype)) - f).abs().max()) > 1e-3
 
 
 @pytest.mark.parametrize(("method", "degree"), [("trilinear", 1), ("triquadratic", 2), ("tricubic", 3)])
@@ -337,8 +358,7 @@ def test_far_outside_the_others_are_periodic(method, boundary):
         laws.assert_close(a, b, 1e-12)
 
 
-@every_way
-@every_boundary
+@every_way_and_boundary
 def test_nan_and_infinite_points_give_no_wrong_number(method, scheme, gradient, prefilter, boundary):
     field = reconstruct(
         torch.ones(3, 4, 5), method, scheme=scheme, gradient=gradient, prefilter=prefilter, boundary=boundary
@@ -390,11 +410,14 @@ def test_points_of_any_shape(method, lead):
         assert gradient.shape == (2, 1, *lead, 3)
 
 
-@every_method
+STORAGES = (torch.uint8, torch.int16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
+POINT_TYPES = (torch.float16, torch.float32, torch.float64, torch.int64)
+
+
 @pytest.mark.parametrize(
-    "storage", [torch.uint8, torch.int16, torch.float16, torch.bfloat16, torch.float32, torch.float64]
+    ("method", "storage", "point_type"),
+    covering(product(METHODS, STORAGES, POINT_TYPES), lambda m, s, p: (m, (kind_of(m), s), (kind_of(m), p), (s, p))),
 )
-@pytest.mark.parametrize("point_type", [torch.float16, torch.float32, torch.float64, torch.int64])
 def test_every_storage_and_point_type(method, storage, point_type):
     """Compute type = promote(points, float32); the volume is read as it is stored and not touched."""
     f = (torch.as_tensor(samples_of((4, 3, 5))) * 100 + 120).to(storage)
@@ -410,9 +433,13 @@ def test_every_storage_and_point_type(method, storage, point_type):
     assert torch.equal(f, kept)
 
 
-@every_method
-@pytest.mark.parametrize("storage", [torch.int8, torch.int32, torch.int64])
-@pytest.mark.parametrize("boundary", ["mirror", "zeros"])
+@pytest.mark.parametrize(
+    ("method", "storage", "boundary"),
+    covering(
+        product(METHODS, (torch.int8, torch.int32, torch.int64), ("mirror", "zeros")),
+        lambda m, s, b: (m, (kind_of(m), s), (kind_of(m), b), (s, b)),
+    ),
+)
 def test_integers_of_any_width_are_the_numbers_that_they_are(method, storage, boundary):
     """Those that torch has, beside what `test_every_storage_and_point_type` takes."""
     f = (torch.as_tensor(samples_of((4, 3, 5))) * 50 + 60).round()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
@@ -14,9 +16,12 @@ from filterlab import bernstein, kernels
 from filterlab.fields import ranges as bounds
 from filterlab.kernels import KERNELS
 from filterlab.methods import from_kernel
-from filterlab.ops.raycast import marks_of, marks_of_bits
+from filterlab.ops.differentiable.bounds import bits_of_blocks
+from filterlab.ops.differentiable.raycast import marks_of_bits
+from filterlab.ops.raycast import marks_of
 from filterlab.ops.reference import bounds as hulls
 from tests import oracles
+from tests.pairs import covering
 from tests.test_methods import CONTINUOUS, TENSOR_PRODUCTS
 
 BOUNDARIES = [str(b) for b in fl.Boundary]
@@ -116,8 +121,13 @@ def test_pieces_of_a_kernel_that_is_a_tensor():
     assert torch.equal(pieces.coefficients[1:][pieces.joined[1:], 0], pieces.coefficients[:-1][pieces.joined[1:], -1])
 
 
-@pytest.mark.parametrize("storage", ["float16", "bfloat16", "float32", "int16", "uint8"])
-@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+@pytest.mark.parametrize(
+    ("method", "storage"),
+    covering(
+        product(TENSOR_PRODUCTS, ("float16", "bfloat16", "float32", "int16", "uint8")),
+        lambda method, storage: (method, storage, (method == "ncrsi", storage)),
+    ),
+)
 def test_storage(method, storage):
     field = fl.reconstruct(100 + 7 * samples(4, 5, 6), method, storage=storage)
     origins, directions = rays(field)
@@ -273,9 +283,12 @@ def test_bounds_are_the_hulls_of_the_cells(name, edge):
     assert bool(most.isfinite().all())
 
 
+@pytest.mark.parametrize("implementation", ["reference", "cpu"])
 @pytest.mark.parametrize("shape", [(1, 1, 1), (3, 2, 64), (2, 17, 129), (16, 24, 40)])
-def test_marks_are_those_of_parts_one_by_one(shape):
+def test_marks_are_those_of_parts_one_by_one(shape, implementation, monkeypatch):
     """Blocks, words and bytes against their definition, a brick at a time."""
+    found = partial(bits_of_blocks, implementation=implementation)
+    monkeypatch.setattr(bounds, "bits_of_blocks", found)
     generator = torch.Generator().manual_seed(sum(shape))
     low = (torch.randn(shape, generator=generator) * 500).short()
     high = low + 30
@@ -283,7 +296,7 @@ def test_marks_are_those_of_parts_one_by_one(shape):
     assert torch.equal(blocks.in_order(blocks.low, shape), low)
     holds = (low <= 1510) & (high >= 1500)
     assert torch.equal(blocks.straddling(1500, 1510), holds)
-    marks = marks_of_bits(blocks.bits(1500, 1510))
+    marks = marks_of_bits(blocks.bits(1500, 1510), implementation)
     assert torch.equal(marks_of(holds), marks)
     whole = np.zeros([2 * -(-n // 2) for n in shape], dtype=bool)
     whole[tuple(slice(n) for n in shape)] = holds.numpy()

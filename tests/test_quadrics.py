@@ -71,10 +71,10 @@ def either(request):
 def test_every_hit_is_found_and_no_other(quadric, either):
     expected = 0
     for kind in quadric_rays.RAYS:
-        found = quadric_rays.verdict(quadric, kind, 12, 0)
+        found = quadric_rays.verdict(quadric, kind, 6, 0)
         assert found["missed"] == found["invented"] == found["inconsistent"] == 0, (kind, found)
         expected += found["expected"]
-    assert expected > 8
+    assert expected > 4
 
 
 def test_a_touching_ray_hits_once(either):

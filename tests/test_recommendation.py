@@ -6,6 +6,7 @@ import functools
 import json
 import math
 import os
+from itertools import product
 
 import pytest
 import torch
@@ -26,8 +27,17 @@ from filterlab.recommendation.ways import WayCost
 from filterlab.scenes.default import suggested
 from filterlab.scenes.model import Scene
 from filterlab.signals import Signal
+from tests.pairs import covering
 
 FAST = {"seconds": 0.05}
+ONE_OF_EACH_KIND = ["trilinear", "mitchell", "ncrsi", "tricubic", "cubic-c1"]
+"""Without and with prefilter, of terms, on tetrahedra: where it is not the choice among all that is asked for."""
+
+
+@pytest.fixture
+def quick(monkeypatch) -> None:
+    """The command measures costs as briefly as the tests."""
+    monkeypatch.setitem(recommend.__kwdefaults__, "seconds", FAST["seconds"])
 
 
 @pytest.fixture(scope="module")
@@ -42,13 +52,13 @@ def found(samples) -> Recommendation:
 
 def test_the_pick_is_the_cheapest_within_the_budget(found) -> None:
     assert found.pick is not None
-    assert found.pick.error.high <= 0.02
+    assert found.pick.error.likely <= 0.02
     for candidate in found.candidates:
-        assert candidate.error.low <= candidate.error.measured <= candidate.error.high
+        assert candidate.error.low <= candidate.error.measured <= candidate.error.likely <= candidate.error.high
         if candidate.seconds < found.pick.seconds:
-            assert candidate.error.high > 0.02
+            assert candidate.error.likely > 0.02
     assert [c.seconds for c in found.candidates] == sorted(c.seconds for c in found.candidates)
-    assert found.best.error.high == min(c.error.high for c in found.candidates)
+    assert found.best.error.likely == min(c.error.likely for c in found.candidates)
 
 
 # --- the interval holds the truth -------------------------------------------------------------------------------------
@@ -92,14 +102,16 @@ def check_held(answer: Recommendation, true: list[float]) -> None:
         assert error <= 1.02 * candidate.error.high, candidate
 
 
-@pytest.mark.parametrize("boundary", [str(b) for b in fl.Boundary])
-@pytest.mark.parametrize("offset", [0.0, 1000.0])
+@pytest.mark.parametrize(
+    ("boundary", "offset"),
+    [*((str(b), 0.0) for b in fl.Boundary), ("zeros", 1000.0), ("border", 1000.0), ("mirror", 1000.0)],
+)
 def test_the_boundary_asked_for_counts(boundary, offset) -> None:
     """Outside is 0 under `zeros`: with an offset of 1000 that is what nearly all of the error comes from."""
     signal = waves(0.3, 20, offset)
     volume = signal.sample(20).samples
     task = "isosurface" if (boundary in ("mirror", "zeros")) == (offset > 0) else "resample"
-    answer = recommend(volume, 1e-9, task=task, boundary=boundary, **FAST)
+    answer = recommend(volume, 1e-9, task=task, boundary=boundary, methods=ONE_OF_EACH_KIND, **FAST)
     true = truths(answer, volume, signal, inner(20))
     check_held(answer, true)
     if boundary == "zeros" and offset:
@@ -135,7 +147,7 @@ def test_arithmetic_counts(dtype) -> None:
     """Waves at an offset of a million: float32 points are computed with in float32, whatever the samples are."""
     signal = waves(0.2, 24, 1e6)
     volume = signal.sample(24, dtype=dtype).samples
-    answer = recommend(volume, 1e-9, **FAST)
+    answer = recommend(volume, 1e-9, methods=ONE_OF_EACH_KIND, **FAST)
     check_held(answer, truths(answer, volume, signal, inner(24)))
     assert answer.best.error.low > 1e-4
 
@@ -146,7 +158,7 @@ def in_unit(scale: float) -> Recommendation:
     return recommend(scale * samples, 0.2, task="dvr", methods=["trilinear", "tricubic"], **FAST)
 
 
-@pytest.mark.parametrize("scale", [1e-30, 1e-3, 1e3, 1e30])
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
 def test_errors_and_steps_are_the_same_in_any_unit(scale) -> None:
     """Squares of 1e-30 underflow; a second derivative that is not taken by the range makes other steps."""
     one, other = in_unit(1.0), in_unit(scale)
@@ -188,7 +200,7 @@ def test_what_is_between_is_said_to_be_undecided() -> None:
     asked = {"methods": ["tricubic"], **FAST}
     error = recommend(noise, 1e-9, **asked).best.error
     assert not recommend(noise, 1e-9, **asked).undecided or error.low <= 1e-9
-    answer = recommend(noise, 0.5 * (error.low + error.high), **asked)
+    answer = recommend(noise, 0.5 * (error.low + error.likely), **asked)
     assert answer.pick is None
     assert answer.undecided
     assert "the samples do not tell" in report.sentences(answer)[1]
@@ -206,7 +218,7 @@ def test_what_a_refusal_says_would_help_does(task: str) -> None:
     assert "antialias=True" in helps
     assert not refused.best.resolved
     budget = float(helps.split("a budget of ")[1].split(" %")[0]) / 100
-    assert refused.best.error.high <= budget <= 1.01 * refused.best.error.high
+    assert refused.best.error.likely <= budget <= 1.01 * refused.best.error.likely
     met = recommend(noise, budget, **asked)
     assert met.pick is not None
     assert f"The most accurate: {refused.best.method}" in best
@@ -215,8 +227,8 @@ def test_what_a_refusal_says_would_help_does(task: str) -> None:
 
 def test_a_refusal_says_where_the_value_alone_would_do(samples) -> None:
     every = recommend(samples, 1e-9, task="isosurface", methods=["tricubic"], **FAST)
-    between = math.sqrt(every.of_value.high * every.best.error.high)
-    assert every.of_value.high < between < every.best.error.high
+    between = math.sqrt(every.of_value.likely * every.best.error.likely)
+    assert every.of_value.likely < between < every.best.error.likely
     refused = recommend(samples, between, task="isosurface", methods=["tricubic"], **FAST)
     assert refused.pick is None
     assert "to count the value alone, as task resample does" in report.sentences(refused)[-1]
@@ -332,7 +344,7 @@ def test_the_step_is_the_longest_within_the_budget(budget, expected) -> None:
 
     def estimate(step: float) -> ErrorEstimate:
         error = math.hypot(0.9, 0.5 * step**2)
-        return ErrorEstimate(error, 0.0, error, error)
+        return ErrorEstimate(error, 0.0, error, 2 * error, error)
 
     step, error = _marched(estimate, budget)
     assert step == expected
@@ -373,8 +385,10 @@ def test_seconds_and_bytes_are_those_of_the_whole_volume(monkeypatch) -> None:
         assert found.seconds == pytest.approx(1e-9 * voxels + 50e-9 * voxels)
 
 
-@pytest.mark.parametrize("boundary", list(fl.Boundary))
-@pytest.mark.parametrize("shape", [(6, 1, 170), (1, 2, 2, 165, 5)])
+@pytest.mark.parametrize(
+    ("boundary", "shape"),
+    covering(product(fl.Boundary, [(6, 1, 170), (1, 2, 2, 165, 5)]), lambda boundary, shape: (boundary, shape)),
+)
 def test_bytes_are_those_of_the_field_that_is_built(boundary, shape, monkeypatch) -> None:
     """Of every method and storage, though only the middle 160 voxels of an axis are looked at."""
     measured, volume = fixed_costs(monkeypatch), fl.Volume(torch.rand(shape))
@@ -425,13 +439,13 @@ def test_limits_of_time_are_seconds(monkeypatch) -> None:
 
 def test_an_interval_widens_with_doubt_spread_and_rounding() -> None:
     plain = Distance(1.0).between("value", 0.0, 20.0)
-    assert plain == (1.0, 1.0)
+    assert plain == (1.0, 1.0, 1.0)
     for wider in (
         Distance(1.0, 0.1).between("value", 0.0, 20.0),
         Distance(1.0).between("value", 0.1, 20.0),
         Distance(1.0).between("value", 0.0, 20.0, rounding=0.5),
     ):
-        assert wider[0] < 1 < wider[1]
+        assert wider[0] < 1 < wider[2] <= wider[1]
     assert Distance(1.0).between("value", 0.1, 0.0)[1] > Distance(1.0).between("value", 0.1, 40.0)[1]
 
 
@@ -439,7 +453,7 @@ def test_every_candidate_has_its_own_step(samples) -> None:
     """Less is left for the march where the method takes more of the budget."""
     answer = recommend(samples, 5.0, task="dvr", methods=["trilinear"], **FAST)
     assert answer.chosen.step == 1.0
-    tight = 1.0001 * recommend(samples, 1e-9, task="isosurface", methods=["tricubic"], **FAST).chosen.error.high
+    tight = 1.0001 * recommend(samples, 1e-9, task="isosurface", methods=["tricubic"], **FAST).chosen.error.likely
     found = recommend(samples, tight, task="dvr", methods=["trilinear", "tricubic"], **FAST)
     steps = {c.method: c.step for c in found.candidates if c.storage is None}
     assert steps["tricubic"] < steps["trilinear"]
@@ -482,7 +496,7 @@ def test_the_same_seed_finds_the_same_errors(samples) -> None:
     ids=["one voxel", "constant", "integers", "flat", "batch", "bytes"],
 )
 def test_any_volume_gets_an_answer(volume) -> None:
-    answer = recommend(volume, 0.5, methods=["trilinear", "triquadratic"], **FAST)
+    answer = recommend(volume, 0.5, methods=["triquadratic"], **FAST)
     for candidate in answer.candidates:
         assert math.isfinite(candidate.error.high)
     assert answer.field(volume) is not None
@@ -528,7 +542,7 @@ def test_data_is_plain(found) -> None:
     assert json.loads(json.dumps(report.data(found), allow_nan=False))["pick"]["method"] == found.chosen.method
 
 
-def test_the_command(samples, tmp_path, capsys) -> None:
+def test_the_command(samples, quick, tmp_path, capsys) -> None:
     file = tmp_path / "v.nrrd"
     fl.save_volume(fl.Volume(samples[:20, :20, :20].clone()), file)
     assert main(["recommend", str(file), "--max-error", "90%", "-o", str(tmp_path / "s.yaml"), "--json"]) == 0
@@ -537,7 +551,7 @@ def test_the_command(samples, tmp_path, capsys) -> None:
     assert yaml.safe_load((tmp_path / "s.yaml").read_text())["method"]["name"] == answer["pick"]["method"]
     assert main(["render", str(tmp_path / "s.yaml"), "-o", str(tmp_path / "p.png"), "--size", "8", "8"]) == 0
     assert main(["recommend", str(file), "--max-error", "0.000001%"]) == 3
-    assert "Nothing surely meets the budget" in capsys.readouterr().out
+    assert "Nothing is likely to meet the budget" in capsys.readouterr().out
 
 
 @pytest.fixture
@@ -575,8 +589,9 @@ def test_a_name_that_no_scene_can_hold_is_refused_before_the_work(no_work, tmp_p
 
 
 @pytest.mark.parametrize("volume", [torch.full((8, 8, 8), 1e8), torch.rand(8, 8, 8)], ids=["constant", "dollar"])
-def test_what_is_written_renders(volume, tmp_path) -> None:
+def test_what_is_written_renders(volume, quick, monkeypatch, tmp_path) -> None:
     """A name with a $ in it stands for itself, and a constant far from zero has control points of its own."""
+    monkeypatch.setattr("filterlab.recommendation.choice.METHODS", {"tricubic": fl.METHODS["tricubic"]})
     (tmp_path / "a$b").mkdir()
     file, scene = tmp_path / "a$b" / "v.npy", tmp_path / "s.yaml"
     fl.save_volume(fl.Volume(volume), file)

@@ -96,7 +96,7 @@ def test_most_points_are_where_the_detail_is_and_some_everywhere() -> None:
 def test_parts_tell_what_the_whole_tells(boundary, monkeypatch) -> None:
     """The same errors from cut-out patches as from the whole volume, at every end and under every boundary."""
     signal = fl.signals.gaussian(sigma=0.25, center=(0.9, -0.9, 0.1))
-    samples = 1000 + signal.sample(72).samples
+    samples = 1000 + signal.sample(56).samples
     whole = Yardstick.of(samples[None], None, boundary)
     monkeypatch.setattr(survey, "WHOLE", 1000)
     parts = Yardstick.of(samples[None], None, boundary)
@@ -178,11 +178,12 @@ def test_the_second_derivative_is_that_of_the_signal() -> None:
 
 
 def test_factors_lie_between_their_knots() -> None:
-    for quantity, (least, most) in CALIBRATION.items():
-        assert len(least) == len(most) == len(FALLS)
-        for fall, c, big in zip(FALLS, least, most, strict=True):
-            assert factors(quantity, fall) == (c, big)
-        assert factors(quantity, FALLS[-1] + 100) == (least[-1], most[-1])
+    for quantity, (least, most, likely) in CALIBRATION.items():
+        assert len(least) == len(most) == len(likely) == len(FALLS)
+        for fall, c, big, nearly in zip(FALLS, least, most, likely, strict=True):
+            assert factors(quantity, fall) == (c, big, nearly)
+            assert nearly <= big
+        assert factors(quantity, FALLS[-1] + 100) == (least[-1], most[-1], likely[-1])
     assert calibration.factors("value", 1.5)[1] == pytest.approx(sum(CALIBRATION["value"][1][1:3]) / 2)
 
 
@@ -197,13 +198,15 @@ def test_a_distance_is_as_sure_as_it_says() -> None:
         rms = torch.tensor([d.rms for d in found])
         assert sum(d.spread for d in found) / 400 == pytest.approx(float(rms.std() / rms.mean()), rel=0.15)
         ends = [d.between("value", 0.0, 0.0) for d in found]
-        assert 0.96 < sum(low <= math.sqrt(true) <= high for low, high in ends) / 400 < 0.998
+        assert 0.96 < sum(low <= math.sqrt(true) <= high for low, high, _ in ends) / 400 < 0.998
     assert _distance([torch.zeros(5)]) == Distance(0.0)
     assert _distance([torch.full((5,), math.inf)]) == Distance(math.inf)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
-@pytest.mark.parametrize("offset", [0.0, 1000.0, -1030.0])
+@pytest.mark.parametrize(
+    ("dtype", "offset"),
+    [(torch.float16, 0.0), (torch.bfloat16, 1000.0), (torch.float32, -1030.0), (torch.float16, -1030.0)],
+)
 def test_what_samples_were_rounded_by_is_in_the_upper_end(dtype, offset) -> None:
     """Noise, kept in a type: the RMS of its rounding, in parts of its range, as that of its largest number at most."""
     exact = offset + 100 * torch.rand(1, 12, 12, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -231,15 +234,17 @@ def test_what_a_task_counts(task, fall) -> None:
         errors = MethodErrors(Distance(value), Distance(gradient))
         counted = {"value": value} if task == "resample" else {"value": value, "gradient": gradient}
         ends = [
-            (max(d - factors(name, fall)[0] * doubts[name], 0), math.hypot(d, factors(name, fall)[1] * doubts[name]))
+            (max(d - c * doubts[name], 0), math.hypot(d, big * doubts[name]), math.hypot(d, likely * doubts[name]))
             for name, d in (counted | {"bend": 0.4}).items()
+            for c, big, likely in [factors(name, fall)]
         ]
-        (*lows, low), (*highs, high) = zip(*ends, strict=True)
+        (*lows, low), (*highs, high), (*likelies, likely) = zip(*ends, strict=True)
         found = yardstick.estimate(task, errors, step)
         assert found.measured == pytest.approx(math.hypot(max(counted.values()), lost * 0.4))
         assert found.doubt == pytest.approx(math.hypot(max(doubts[name] for name in counted), lost * 0.05))
         assert found.low == pytest.approx(math.hypot(max(lows), lost * low))
         assert found.high == pytest.approx(math.hypot(max(highs), lost * high))
+        assert found.likely == pytest.approx(math.hypot(max(likelies), lost * likely))
 
 
 def test_a_sample_stands_for_its_step_but_for_a_24th_of_the_second_derivative() -> None:

@@ -19,6 +19,7 @@ from filterlab.methods import METHODS, reconstruct
 from filterlab.resampling import resample
 from filterlab.volume import Boundary, Volume
 from tests import laws, oracles
+from tests.pairs import in_pairs
 from tests.test_volume import rotated
 
 every_method = pytest.mark.parametrize("method", METHODS)
@@ -36,9 +37,7 @@ def centres(grid: Volume) -> torch.Tensor:
     return grid.voxel_to_world(torch.as_tensor(np.stack([x, y, z], -1).astype(float)))
 
 
-@every_method
-@every_boundary
-@pytest.mark.parametrize("prefilter", [True, False])
+@pytest.mark.parametrize(("method", "boundary", "prefilter"), in_pairs(product(METHODS, Boundary, (True, False))))
 def test_separable_equals_the_field_point_by_point(method, boundary, prefilter):
     source = Volume(volume(), spacing=(1.0, 0.5, 2.0), origin=(3.0, -1.0, 0.0))
     like = Volume(torch.zeros(3, 9, 8), spacing=(1.7, 0.4, 9.0), origin=(-4.0, -0.7, -6.0))  # well beyond the box

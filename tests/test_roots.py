@@ -14,6 +14,7 @@ from experiments.polynomial_families import FAMILIES
 from experiments.root_finding import suspicious, tolerance
 from filterlab import roots
 from filterlab.roots import all_roots, first_root
+from tests.pairs import in_pairs
 
 DTYPES = [torch.float64, torch.float32]
 DIGITS = {torch.float64: 53, torch.float32: 24}
@@ -32,9 +33,7 @@ def assert_right(c, t):
         assert verdict not in BAD, (verdict, coefficients, root)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("degree", range(2, 10))
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize(("family", "degree", "dtype"), in_pairs(itertools.product(FAMILIES, range(2, 10), DTYPES)))
 def test_first_roots_are_those_of_exact_arithmetic(family, degree, dtype):
     c = made(family, degree, 6, dtype)
     assert_right(c, first_root(c))
@@ -122,10 +121,10 @@ FOUND = {
 @pytest.mark.parametrize("degree", range(1, 10))
 def test_between_ends_of_opposite_signs_there_is_a_root(degree, dtype):
     """However wide the scale of the coefficients: near either end several of them may lie between two floats."""
-    sign = torch.where(torch.rand(10_000, degree + 1) < 0.5, -1.0, 1.0).double()
+    sign = torch.where(torch.rand(3_000, degree + 1) < 0.5, -1.0, 1.0).double()
     sign[:, -1] = -sign[:, 0]
     top = 25 if dtype == torch.float32 else 200
-    c = (sign * 10 ** ((2 * torch.rand(10_000, degree + 1, dtype=torch.float64) - 1) * top)).to(dtype)
+    c = (sign * 10 ** ((2 * torch.rand(3_000, degree + 1, dtype=torch.float64) - 1) * top)).to(dtype)
     c = torch.cat((c, c.abs().sort(1).values * (-1.0) ** torch.arange(degree + 1).to(dtype)))  # falls by orders
     opposite = c[:, 0].sign() * c[:, -1].sign() < 0
     assert (first_root(c[opposite]) <= 1).all()
@@ -263,7 +262,7 @@ def test_a_power_of_two_changes_no_bit(degree, dtype, powers):
 
 @pytest.mark.parametrize("degree", range(1, 10))
 def test_nobody_depends_on_the_company(degree):
-    c = made("random", degree, 300, seed=11)
+    c = made("random", degree, 100, seed=11)
     together = first_root(c)
     assert torch.equal(torch.cat([first_root(part) for part in c.split(7)]), together)
     assert torch.equal(first_root(c.flip(0)).flip(0), together)

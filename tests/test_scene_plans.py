@@ -199,12 +199,12 @@ field = reconstruct(torch.rand(3, 3, 3), "trilinear")
 transfer = TransferFunction([0.0, 1.0], [[1.0, 0.5, 0.2]] * 2, [0.1, 0.2])
 camera, sampling = PerspectiveCamera.framing(field.domain, margin=3.0), Sampling(step=10.0, memory=int(sys.argv[1]))
 prepare(field, camera, transfer, size=(64, 64), sampling=sampling).run()  # what is compiled is there now
-frame = prepare(field, camera, transfer, size=(1200, 1000), sampling=sampling)
+frame = prepare(field, camera, transfer, size=(800, 700), sampling=sampling)
 said, image = (frame.image_bytes, frame.ray_bytes), None
 del frame
 Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak begins anew
 before = status("VmRSS")
-image = prepare(field, camera, transfer, size=(1200, 1000), sampling=sampling).run()
+image = prepare(field, camera, transfer, size=(800, 700), sampling=sampling).run()
 print(field.scheme.name, image.nbytes, *said, status("VmHWM") - before)
 """
 
@@ -220,7 +220,7 @@ def test_an_image_takes_the_memory_that_is_said(memory: int) -> None:
     scheme, *numbers = told.stdout.split()
     image, image_said, rays_said, peak = map(int, numbers)
     assert scheme == "fused"
-    assert image == image_said == 16 * 1200 * 1000
+    assert image == image_said == 16 * 800 * 700
     # 16 MiB for what the allocator and the threads take
     assert 0.5 * image < peak <= image + rays_said + 2**24
 

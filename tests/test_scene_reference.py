@@ -30,10 +30,11 @@ def test_every_key_is_described_and_has_an_example(
     heading: str, model: type[Section], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Examples are valid sections; together they set every key."""
-    for name in ("engine.nrrd", "head.nii.gz", "series.nii.gz"):
+    for name in ("engine.nrrd", "head.nii.gz", "series.nii.gz", "dem.tif", "photo.jpg", "caffeine.xyz"):
         (tmp_path / name).touch()
     save_image(torch.rand(4, 8, 3), tmp_path / "sky.png")
     np.savez(tmp_path / "bunny.npz", slim=1)
+    np.savez(tmp_path / "glyphs.npz", quadrics=1)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SCANS", str(tmp_path))
     assert set(reference.described(model)) == set(model.model_fields)

@@ -100,7 +100,7 @@ def test_a_volume_is_enough(tmp_path: Path) -> None:
         ("mip: false", "mip"),
         ("mip: {width: 0, center: 1}", "mip.width: expected greater than 0"),
         ("mip: {colormap: greyish}", "unknown colormap"),
-        ("mip: true\nslice: z", "expected one of surface, mip, slice; got mip and slice"),
+        ("mip: true\nslice: z", "expected one of surface, terrain, mip, slice; got mip and slice"),
         ("mip: true\nsurface: 0.5", "got surface and mip"),
         (
             "mip: true\ntermination: 0.1\nlighting: {}",

@@ -13,8 +13,8 @@ from filterlab.cli import main
 from filterlab.io.covers import load_slim, save_slim
 from filterlab.io.images import load_image
 from filterlab.io.points import load_points
-from filterlab.scenes.build import PreparedSlim, build, load_scene
-from filterlab.surfaces import fit_slim
+from filterlab.scenes.build import build, load_scene
+from filterlab.surfaces import Slim, fit_slim
 from tests.test_fitting import sphere
 
 POINTS = sphere(400)
@@ -145,7 +145,7 @@ def test_scenes_have_covers_with_any_camera_and_material(cover, tmp_path):
         load_scene(scene)
     (tmp_path / cover.name).write_bytes(cover.read_bytes())
     prepared = build(load_scene(scene, {"size": "[20, 20]"}))
-    assert isinstance(prepared, PreparedSlim)
+    assert isinstance(prepared.surface, Slim)
     assert float(prepared.render()[10, 10, 3]) == 1.0
     assert (
         main(["render", str(scene), "--turntable", "2", "-o", str(tmp_path / "a.gif"), "--size", "8", "8", "-q"]) == 0
@@ -169,8 +169,11 @@ def test_what_is_known_of_a_cover(cover, capsys):
         (["resample", "{cover}", "-o", "a.nrrd", "--spacing", "1", "1", "1"], "samples"),
         (["render", "{volume}", "--surface", "{surface: 1}", "-o", "a.png"], "surface"),
         (["render", "slim.yaml", "-o", "a.png"], "expected a file that `filterlab slim` wrote"),
-        (["render", "both.yaml", "-o", "a.png"], "expected either a level or a slim; got both"),
-        (["render", "method.yaml", "-o", "a.png"], "method: a SLIM surface is in a file of its own"),
+        (
+            ["render", "both.yaml", "-o", "a.png"],
+            "expected one of level, slim, quadrics, ellipsoids, molecule; got level and slim",
+        ),
+        (["render", "method.yaml", "-o", "a.png"], "method: a SLIM surface is no part of a volume"),
     ],
 )
 def test_covers_and_volumes_are_not_mistaken_for_each_other(cover, tmp_path, monkeypatch, capsys, arguments, told):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import cycle, product
 
 import pytest
 import torch
@@ -11,6 +12,8 @@ import filterlab as fl
 from filterlab.fields.grid import GridField
 from filterlab.fields.storage import STORAGE, stored_as
 from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction, fused, render
+from tests.pairs import covering
+from tests.test_methods import kind_of
 
 INTEGER = ["int16", "int8", "uint8"]
 # the largest rounding: half a unit in the last place of a number below 2, or half a step of the range
@@ -38,9 +41,10 @@ def scene(field: GridField):
     return camera, transfer
 
 
-@pytest.mark.parametrize("storage", STORAGE)
-@pytest.mark.parametrize("method", fl.METHODS)
-@pytest.mark.parametrize("boundary", ["mirror", "zeros"])
+@pytest.mark.parametrize(
+    ("method", "storage", "boundary"),
+    covering(product(fl.METHODS, STORAGE, ("mirror", "zeros")), lambda m, s, b: ((m, b), (kind_of(m), s), (s, b))),
+)
 def test_a_field_is_that_of_its_rounded_coefficients(method, storage, boundary):
     volume = samples(8, 9, 7)
     exact = built(volume, method, boundary=boundary, scheme="direct")
@@ -95,9 +99,9 @@ def test_every_volume_of_a_batch_has_its_own_range(storage):
                 assert torch.equal(g, gradients[n, c])
 
 
-@pytest.mark.parametrize("storage", [None, *STORAGE])
-@pytest.mark.parametrize("shading", [None, Shading(lights=[Light((0.3, -1, 0.5))])])
-def test_the_fused_march_shows_what_the_plain_one_shows(storage, shading, monkeypatch):
+@pytest.mark.parametrize(("storage", "lit"), list(zip((None, *STORAGE), cycle((True, False)), strict=False)))
+def test_the_fused_march_shows_what_the_plain_one_shows(storage, lit, monkeypatch):
+    shading = Shading(lights=[Light((0.3, -1, 0.5))]) if lit else None
     field = built(10 * samples(12, 12, 12), "tricubic", storage=storage)
     camera, transfer = scene(field)
     transfer = TransferFunction(10 * transfer.positions, transfer.colors, transfer.opacities)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -18,10 +19,10 @@ from filterlab.fields.type6 import CUBIC_C1, QSS
 from filterlab.methods import METHODS, Tetrahedral
 from filterlab.render import PerspectiveCamera, TransferFunction
 from tests import laws, tetrahedral_oracle
+from tests.pairs import in_pairs
 
 SPLINES = [name for name, method in METHODS.items() if isinstance(method, Tetrahedral)]
 every_spline = pytest.mark.parametrize("name", SPLINES)
-every_boundary = pytest.mark.parametrize("boundary", list(fl.Boundary))
 
 
 def samples(*shape: int, seed: int = 0) -> Tensor:
@@ -41,10 +42,10 @@ def around(shape: tuple[int, ...], count: int, seed: int = 1) -> Tensor:
 # ---- the oracle
 
 
-@every_spline
-@every_boundary
-@pytest.mark.parametrize("prefilter", [True, False])
-@pytest.mark.parametrize("scheme", ["fused", "direct"])
+@pytest.mark.parametrize(
+    ("name", "scheme", "prefilter", "boundary"),
+    in_pairs(product(SPLINES, ("fused", "direct"), (True, False), fl.Boundary)),
+)
 def test_axes_of_every_length(name, scheme, prefilter, boundary):
     """n = 1 … 9 and 32 along each axis: ≤ 1e-12 in float64, ≤ 5e-6 of the range in float32."""
     for n in (*range(1, 10), 32):

@@ -137,7 +137,7 @@ def test_mistakes_are_found_before_anything_is_built(
     (tmp_path / "full" / "notes.txt").touch()
     (tmp_path / "file").touch()
     for arguments, words in (
-        (["--turntable", "1", "-o", tmp_path / "a"], "at least 2 pictures; got 1"),
+        (["--turntable", "1", "-o", tmp_path / "a"], "at least 2 pictures of a turn or a flight; got 1"),
         (["--turntable", "3", "-o", tmp_path / "full"], "a new or an empty folder; got one with files"),
         (["--turntable", "3", "-o", tmp_path / "file"], "a new or an empty folder; got a file"),
         (["--turntable", "3", "-o", tmp_path / "no" / "frames"], "expected an existing folder"),
@@ -148,7 +148,7 @@ def test_mistakes_are_found_before_anything_is_built(
         ),
         (["-o", tmp_path / "frames"], "ends in .png or .jpg"),
     ):
-        assert main(["render", str(scene_file), *map(str, arguments)]) == 1
+        assert main(["render", str(scene_file), *map(str, arguments)]) == (2 if arguments[1:2] == ["1"] else 1)
         assert words in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "full", "scene.yaml"]
 

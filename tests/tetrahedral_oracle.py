@@ -147,14 +147,13 @@ class Tetrahedron:
 
     def image(self, matrix: np.ndarray) -> Tetrahedron:
         """Itself under a signed permutation of the axes."""
-        masks = {
-            alpha: {_turned(matrix, at): weight for at, weight in mask.items()} for alpha, mask in self.masks.items()
-        }
+        to = {at: _turned(matrix, at) for at in {at for mask in self.masks.values() for at in mask}}
+        masks = {alpha: {to[at]: weight for at, weight in mask.items()} for alpha, mask in self.masks.items()}
         return Tetrahedron(self.kind, tuple(_turned(matrix, v) for v in self.vertices), masks)
 
 
 def _turned(matrix: np.ndarray, v: Vector) -> Vector:
-    x, y, z = (sum(int(m) * c for m, c in zip(row, v, strict=True)) for row in matrix)
+    x, y, z = (sum(int(m) * c for m, c in zip(row, v, strict=True) if m) for row in matrix)
     return Fraction(x), Fraction(y), Fraction(z)
 
 

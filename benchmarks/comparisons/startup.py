@@ -1,4 +1,4 @@
-"""The first call of a kernel in a fresh process: compiled, and loaded from the cache on disk."""
+"""The first call of a kernel in a fresh process, compiled and loaded from the cache on disk; of torch.compile."""
 
 from __future__ import annotations
 
@@ -37,10 +37,35 @@ def _first_calls(first: str, other: str, settings: Settings, tick: Tick) -> Outc
     )
 
 
+def _torch_compile(settings: Settings, tick: Tick) -> Outcome:
+    """Every round with an empty cache folder of torch's compiler."""
+    rounds = 1 if settings.quick else min(settings.repeats, 3)
+    found: dict[str | None, list[float]] = {_METHODS[0]: [], None: []}
+    for r in range(rounds):
+        for method, runs in found.items():
+            with tempfile.TemporaryDirectory() as folder:
+                environment = {"TORCHINDUCTOR_CACHE_DIR": folder}
+                runs.append(measured("torch_compile", environment, threads=1, method=method)["seconds"])
+        tick((r + 1) / rounds)
+    step, least = (Spread.of(runs) for runs in found.values())
+    return Outcome(
+        name="torch.compile",
+        what="CPU time of the first call and its derivatives, with torch's compilers, in a fresh process; 4,096 points",
+        rounds=rounds,
+        figures=(
+            Figure(name=f"step that trains a {_METHODS[0]} Reconstruction", spread=step, unit="s", bar=at_most("15 s")),
+            Figure(name="sum of sines", spread=least, unit="s"),
+        ),
+    )
+
+
 def _items(settings: Settings) -> list[Item]:
     return [
-        Item(f"{first}-first", 50, lambda s, tick, first=first, other=other: _first_calls(first, other, s, tick))
-        for first, other in (_METHODS, _METHODS[::-1])
+        *(
+            Item(f"{first}-first", 50, lambda s, tick, first=first, other=other: _first_calls(first, other, s, tick))
+            for first, other in (_METHODS, _METHODS[::-1])
+        ),
+        Item("torch.compile", 100, _torch_compile),
     ]
 
 

@@ -43,6 +43,7 @@ SILENCE = 60.0  # seconds; a call that takes longer hangs: the process tells whe
 _EXITS = 25  # one process ends behind so many interrupts
 _AGAIN = 0.02  # seconds; an interrupt that was swallowed (in a `__del__`) comes again
 _POINTS = 40_000
+_PROGRAMS = "programs"  # where they are kept
 
 Call = Callable[[], list[Tensor]]
 
@@ -85,7 +86,7 @@ def works(folder: Path) -> dict[str, Call]:
         "adjoint": lambda: _by_samples(samples[:12, :12, :12].clone()),
         "reading": lambda: _read(folder),
         "writing": lambda: _written(folder, samples[:16]),
-        "compiling": lambda: _compiled(located[:, :100], samples),
+        "compiling": lambda: _compiled(folder, located[:, :100], samples),
     }
 
 
@@ -122,17 +123,20 @@ def _written(folder: Path, samples: Tensor) -> list[Tensor]:
     return [load_volume(path).samples]
 
 
-def _compiled(points: Tensor, samples: Tensor) -> list[Tensor]:
-    """Nothing in memory, and nothing on disk every other time.
+def _compiled(folder: Path, points: Tensor, samples: Tensor) -> list[Tensor]:
+    """Nothing in memory, and every other time not on disk: in a place of its own, as to make all anew takes seconds.
 
     Programs are let go aside, which the library never does: llvmlite's lock would stay locked behind an interrupt.
     """
     aside(compiler._programs.clear)
-    where = cache.folder()
-    if where is not None and random.random() < 0.5:
-        for file in where.glob("*.o"):
-            file.unlink(missing_ok=True)
-    return [ops.jet(samples[None, None], points, bspline(1), 1, 0, "cpu")]
+    os.environ[cache.VARIABLE] = str(folder / "compiled")
+    try:
+        if random.random() < 0.5:
+            for file in (folder / "compiled").glob("*.o"):
+                file.unlink(missing_ok=True)
+        return [ops.jet(samples[None, None], points, bspline(1), 1, 0, "cpu")]
+    finally:
+        os.environ[cache.VARIABLE] = str(folder / _PROGRAMS)
 
 
 # --- interrupts -------------------------------------------------------------------------------------------------------
@@ -178,7 +182,7 @@ def main(count: int, seed: int, *chosen: str) -> None:
     signal.signal(signal.SIGALRM, _raise)
     dice, result = random.Random(seed), Interrupted()
     with _folder_of_this_process() as name:
-        os.environ[cache.VARIABLE] = f"{name}/programs"
+        os.environ[cache.VARIABLE] = str(Path(name) / _PROGRAMS)
         for path in _files(Path(name)):
             save_volume(fl.Volume(torch.rand(12, 12, 12)), path)
         driver.SMALLEST_SORTED_IN, driver.FEWEST_SORTED = 0, _POINTS

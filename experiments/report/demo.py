@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.report import dvr_signal, dvr_volume, frequency_response, rms_error, texture_precision
+from experiments.report import dvr_signal, dvr_volume, frequency_response, rms_error, terrain_views, texture_precision
 from experiments.report.page import Section
 from experiments.runs import Record
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 DRAW = {
     module.__name__.rpartition(".")[2]: module.draw
-    for module in (frequency_response, rms_error, dvr_signal, dvr_volume, texture_precision)
+    for module in (frequency_response, rms_error, dvr_signal, dvr_volume, texture_precision, terrain_views)
 }
 
 

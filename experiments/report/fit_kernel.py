@@ -218,7 +218,7 @@ def _matrix(axes: Axes, records: Sequence[Record], taps: int, titles: Sequence[s
     for (row, column), ratio in np.ndenumerate(ratios):
         if math.isfinite(ratio):
             axes.text(column, row, fixed(ratio), ha="center", va="center", color=plots.INK)
-    axes.set_xticks(range(len(titles)), [_wrapped(t) for t in titles], fontsize=7.5)
+    axes.set_xticks(range(len(titles)), [_wrapped(t) for t in titles], fontsize=8.5)
     axes.set_title(f"{taps} taps, tested on")
     axes.xaxis.tick_top()
     axes.tick_params(length=0)

@@ -35,6 +35,8 @@ def _study(config: Config, study: Study, index: int, records: Mapping[str, Recor
     blocks: list[Block] = []
     if errors:
         blocks += [_curves(config, study, index, errors), _numbers(study, errors)]
+        if any(r["elsewhere"] for r in errors.values()):
+            blocks.append(_elsewhere(study, errors))
     if fits:
         blocks.append(_orders(fits))
     return Section(f"{study.signal.label}, level {study.level:g}", (), blocks)
@@ -59,25 +61,33 @@ def _curves(config: Config, study: Study, index: int, errors: Errors) -> Plot:
 
 
 def _numbers(study: Study, errors: Errors) -> Table:
+    quantities = {"distance": "distance_rms", "normal": "normal_rms"}
     columns = [Column("method", numeric=False)]
-    for n in study.resolutions:
-        columns += [Column(f"{n}³", "distance"), Column("", "normal"), Column("", "elsewhere")]
+    for title in quantities:
+        columns += [Column(title if i == 0 else "", f"{n}³") for i, n in enumerate(study.resolutions)]
     rows = []
-    for recipe in recipes(errors):
-        found = [errors.get((recipe, n)) for n in study.resolutions]
-        name = label(next(r for r in found if r))
-        rows.append([name, *(cell for r in found for cell in _cells(r))])
-    caption = (
-        "RMS errors of distance (world units) and normal (radians). Elsewhere: rays that hit nothing within two voxels "
-        "of the signal's hit, another piece of surface or none; the means are without them."
-    )
+    for name, found in _by_resolution(study, errors):
+        rows.append([name, *(text(r[key]) if r else MISSING for key in quantities.values() for r in found)])
+    caption = "RMS errors of distance (world units) and normal (radians)."
+    if any(r["elsewhere"] for r in errors.values()):
+        caption += " Rays whose hit is elsewhere are left out: they are counted below."
     return Table(columns, rows, caption)
 
 
-def _cells(record: Record | None) -> tuple[str, str, str]:
-    if record is None:
-        return MISSING, MISSING, MISSING
-    return text(record["distance_rms"]), text(record["normal_rms"]), f"{record['elsewhere']:,}"
+def _elsewhere(study: Study, errors: Errors) -> Table:
+    columns = [Column("method", numeric=False), *(Column(f"{n}³") for n in study.resolutions)]
+    rows = [
+        [name, *(f"{r['elsewhere']:,}" if r else MISSING for r in found)]
+        for name, found in _by_resolution(study, errors)
+    ]
+    caption = "Rays that hit nothing within two voxels of the signal's hit: another piece of surface, or none."
+    return Table(columns, rows, caption)
+
+
+def _by_resolution(study: Study, errors: Errors) -> list[tuple[str, list[Record | None]]]:
+    """What each recipe is called, and its records at the study's resolutions."""
+    found = [[errors.get((recipe, n)) for n in study.resolutions] for recipe in recipes(errors)]
+    return [(label(next(r for r in records if r)), records) for records in found]
 
 
 def _orders(fits: list[Record]) -> Table:

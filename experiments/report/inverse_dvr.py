@@ -281,13 +281,14 @@ def _curves(config: Config, records: Sequence[Record]) -> Plot:
             strips.set_xlabel("value")
         figure.legend(handles=_handles(records), loc="outside lower center", ncols=5, frameon=False)
         drawn = plots.svg(figure, "inverse-transfer")
+    shares = records[0]["histogram"]["shares"]
     caption = (
         "Target, start and recovered transfer functions; markers are control points. Shaded: how often a value occurs "
-        "in the volume (share of the box, not to scale). Below: their colours, as high as they are opaque, for what "
-        "is transparent has no colour that an image could show. A value that does not occur, or that is always hidden, "
-        "is not recovered; at the least and the largest values few samples decide. Of a thin medium an image tells "
-        "opacity times the contrast to what is behind, and hardly either by itself: less of the one and more of the "
-        "other look alike."
+        f"in the volume, linear from 0; the highest of {len(shares)} bars is {100 * max(shares):.3g} % of it. "
+        "Below: their colours, as high as they are opaque, for what is transparent has no colour that an image could "
+        "show. A value that does not occur, or that is always hidden, is not recovered; at the least and the largest "
+        "values few samples decide. Of a thin medium an image tells opacity times the contrast to what is behind, and "
+        "hardly either by itself: less of the one and more of the other look alike."
     )
     if config.images_of == "signal":
         caption += (

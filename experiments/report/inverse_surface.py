@@ -94,7 +94,7 @@ def convergence(
         for axes, (quantity, title) in zip(figure.subplots(1, len(panels)), panels, strict=True):
             for r in records:
                 axes.plot(*zip(*_course(r, quantity), strict=True), **look(r))
-            axes.set_title(title, fontsize=8)
+            axes.set_title(title, fontsize=9)
             axes.set_xlabel("iteration")
             axes.set_xlim(left=0)
             values = [value for r in records for _, value in _course(r, quantity)]

@@ -57,7 +57,7 @@ def _course(records: Sequence[Record]) -> Plot:
             for k, r in enumerate(records):
                 seen = [(o["iteration"], o[quantity]) for o in r["observations"] if o[quantity] is not None]
                 axes.plot(*zip(*seen, strict=True), color=OTHERS[k % len(OTHERS)].light, label=f"from {r['compared']}")
-            axes.set_title(title, fontsize=8)
+            axes.set_title(title, fontsize=9)
             axes.set_xlabel("iteration")
             axes.set_xlim(left=0)
             plots.logarithmic(axes)

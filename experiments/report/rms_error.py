@@ -40,7 +40,9 @@ def _study(config: Config, study: Study, index: int, records: Mapping[str, Recor
     errors, fits = of_study(index, records)
     blocks: list[Block] = []
     if errors:
-        blocks += [_curves(study, index, errors, config), _numbers(study, errors)]
+        blocks.append(_curves(study, index, errors, config))
+        blocks.append(_numbers(study, errors, "value_rms", "RMS errors of the value at each resolution."))
+        blocks.append(_numbers(study, errors, "gradient_rms", "RMS errors of the gradient, per world unit."))
     if fits:
         blocks.append(_orders(fits))
     return Section(study.signal.label, (), blocks)
@@ -96,17 +98,14 @@ def recipes(errors: Errors) -> list[str]:
     return list(dict.fromkeys(recipe for recipe, _ in errors))
 
 
-def _numbers(study: Study, errors: Errors) -> Table:
-    columns = [Column("method", numeric=False)]
-    for n in study.resolutions:
-        columns += [Column(f"{n}³", "value"), Column("", "gradient")]
+def _numbers(study: Study, errors: Errors, quantity: str, caption: str) -> Table:
+    columns = [Column("method", numeric=False), *(Column(f"{n}³") for n in study.resolutions)]
     rows = []
     for recipe in recipes(errors):
         found = [errors.get((recipe, n)) for n in study.resolutions]
         name = label(next(r for r in found if r))
-        pairs = [(text(r["value_rms"]), text(r["gradient_rms"])) if r else (MISSING, MISSING) for r in found]
-        rows.append([name, *(cell for pair in pairs for cell in pair)])
-    return Table(columns, rows, "RMS errors of value and gradient (per world unit) at each resolution.")
+        rows.append([name, *(text(r[quantity]) if r else MISSING for r in found)])
+    return Table(columns, rows, caption)
 
 
 def _orders(fits: list[Record]) -> Table:

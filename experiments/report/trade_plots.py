@@ -112,14 +112,14 @@ def _front(axes: Axes, corners: Sequence[tuple[float, float]], names: Sequence[s
         return
     axes.plot(*zip(*corners, strict=True), drawstyle="steps-post", **FRONT)
     for i, corner in enumerate(corners, 1):
-        style = {"textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 7.5, "fontweight": "bold"}
+        style = {"textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 8.5, "fontweight": "bold"}
         axes.annotate(str(i), corner, xytext=(-4, -2), **style)
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    axes.set_ylim(low, high * (high / low) ** (0.06 * len(names)))  # room for the list
+    axes.set_ylim(low, high * (high / low) ** (0.075 * len(names)))  # room for the list
     listed = "\n".join(f"{i}  {name}" for i, name in enumerate(names, 1))
     axes.text(
-        0.98, 0.99, listed, transform=axes.transAxes, ha="right", va="top", fontsize=7, linespacing=1.35, ma="left"
+        0.98, 0.99, listed, transform=axes.transAxes, ha="right", va="top", fontsize=8.5, linespacing=1.3, ma="left"
     )
 
 

@@ -4,51 +4,37 @@ from __future__ import annotations
 
 import inspect
 import os
+import shutil
 import sys
+import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any, Union
+from importlib import import_module
+from typing import Any
 
-import tyro
-from tyro.conf import subcommand
-
-from filterlab.cli.convert import Convert, with_output_last
-from filterlab.cli.info import Info
-from filterlab.cli.mesh import Mesh
-from filterlab.cli.methods import Methods
 from filterlab.cli.outcome import FAILED, INTERRUPTED, OK, USAGE, UsageError, message_of, out_of_memory, shortage
-from filterlab.cli.recommend import Recommend
-from filterlab.cli.render import Render
-from filterlab.cli.resample import Resample
-from filterlab.cli.scene import Scene
-from filterlab.cli.scenes import split_overrides
-from filterlab.cli.sdf import Sdf
-from filterlab.cli.slim import Slim
 from filterlab.cli.terminal import tell
-from filterlab.cli.terrain import Terrain
 from filterlab.names import unknown_name
 from filterlab.notices import Notice
 
-DESCRIPTION = """Reconstruction filters for sampled volumes: look at scans, resample and convert them, compare methods.
+DESCRIPTION = (
+    "Reconstruction filters for sampled volumes: look at scans, resample and convert them, compare methods.",
+    "filterlab COMMAND --help tells more, with examples. filterlab --version tells the version.",
+)
+COMMANDS = (
+    *("render", "mesh", "scene", "terrain", "sdf", "slim"),
+    *("resample", "convert", "recommend", "methods", "info"),
+)
+"""Each is the class of its name in the module of its name, imported when it is asked for."""
 
-filterlab COMMAND --help tells more, with examples. filterlab --version tells the version."""
-
-COMMANDS: dict[str, Any] = {
-    "render": Render,
-    "mesh": Mesh,
-    "scene": Scene,
-    "terrain": Terrain,
-    "sdf": Sdf,
-    "slim": Slim,
-    "resample": Resample,
-    "convert": Convert,
-    "recommend": Recommend,
-    "methods": Methods,
-    "info": Info,
-}
-SHOWING: dict[str, Any] = {"render": Render, "mesh": Mesh, "scene": Scene}
+SHOWING = ("render", "mesh", "scene")
 """Those that take a scene, and changes to it."""
+
+
+def kind_of(command: str) -> Any:
+    """The class of a command."""
+    return getattr(import_module(f"filterlab.cli.{command}"), command.capitalize())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -59,14 +45,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         print(f"filterlab {version('filterlab')}")
         return OK
-    overrides: dict[str, str] = {}
+    if not arguments or arguments[0] in ("--help", "-h"):
+        _show_help()
+        return OK
     try:
-        if arguments[:1] == ["convert"]:
-            arguments = with_output_last(arguments)
-        if arguments and arguments[0] in SHOWING:
-            arguments, overrides = split_overrides(SHOWING[arguments[0]], arguments)
+        kind = kind_of(_command(arguments[0]))
+        arguments, overrides = _split(kind, arguments)
         with _warnings_told():
-            return _parse(arguments or ["--help"]).run(overrides) or OK
+            return _parse(kind, arguments).run(overrides) or OK
     except SystemExit as exit:  # tyro: --help, or usage
         return exit.code if isinstance(exit.code, int) else USAGE
     except UsageError as error:
@@ -107,15 +93,44 @@ def _warnings_told() -> Iterator[None]:
         yield
 
 
-def _parse(arguments: list[str]) -> Any:
-    """The command that was asked for. tyro prints help and mistakes of usage, and exits."""
-    name = arguments[0]
-    if name not in COMMANDS and not name.startswith("-"):
-        tell(unknown_name("command", name, COMMANDS))
+def _command(name: str) -> str:
+    """The name of a command. Raises SystemExit for any other."""
+    if name not in COMMANDS:
+        tell(
+            f"expected a command first; got {name}" if name.startswith("-") else unknown_name("command", name, COMMANDS)
+        )
         raise SystemExit(USAGE)
-    if name in COMMANDS:
-        kind = COMMANDS[name]
-        return tyro.cli(kind, prog=f"filterlab {name}", description=inspect.cleandoc(kind.__doc__), args=arguments[1:])
-    kinds = (Annotated[k, subcommand(n, description=k.__doc__.split("\n")[0])] for n, k in COMMANDS.items())
-    any_of_them: Any = Union[tuple(kinds)]  # noqa: UP007
-    return tyro.cli(any_of_them, prog="filterlab", description=DESCRIPTION, args=arguments)
+    return name
+
+
+def _split(kind: Any, arguments: list[str]) -> tuple[list[str], dict[str, str]]:
+    """What a command takes itself, its name first, and changes to the scene that it is given."""
+    if arguments[0] == "convert":
+        from filterlab.cli.convert import with_output_last
+
+        return with_output_last(arguments), {}
+    if arguments[0] in SHOWING:
+        from filterlab.cli.scenes import split_overrides
+
+        return split_overrides(kind, arguments)
+    return arguments, {}
+
+
+def _parse(kind: Any, arguments: list[str]) -> Any:
+    """The command that was asked for. tyro prints help and mistakes of usage, and exits."""
+    import tyro
+
+    prog, description = f"filterlab {arguments[0]}", inspect.cleandoc(kind.__doc__)
+    return tyro.cli(kind, prog=prog, description=description, args=arguments[1:])
+
+
+def _show_help() -> None:
+    """Prints what there is, a sentence for every command."""
+    width = min(shutil.get_terminal_size().columns, 100)
+    print("usage: filterlab COMMAND ...\n")
+    for paragraph in DESCRIPTION:
+        print(textwrap.fill(paragraph, width), end="\n\n")
+    print("commands:")
+    for name in COMMANDS:
+        sentence = kind_of(name).__doc__.split("\n")[0]
+        print(textwrap.fill(sentence, width, initial_indent=f"  {name:<11}", subsequent_indent=13 * " "))

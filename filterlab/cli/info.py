@@ -12,12 +12,14 @@ from tyro.conf import Positional, arg
 
 from filterlab.cli.loading import reading
 from filterlab.cli.options import Channel, Frame
-from filterlab.cli.terminal import progress_bar, show, tell
+from filterlab.cli.terminal import progress_bar, tell
 from filterlab.world import RAS, World
 
 if TYPE_CHECKING:
     import numpy as np
+    from torch import Tensor
 
+    from filterlab.fields.base import Domain
     from filterlab.io.bounded import VolumeHeader
     from filterlab.io.heights_header import HeightsHeader
 
@@ -27,7 +29,7 @@ AT_ONCE = 2**17  # numbers
 
 @dataclass(frozen=True)
 class Info:
-    """Show what is in a file of a volume, of heights or of a SLIM surface: its header, where it lies, and its values.
+    """Show what is in a file of a volume, of heights, of a SLIM surface or of quadrics: its header, place and values.
 
     examples:
       filterlab info engine.nrrd
@@ -39,7 +41,7 @@ class Info:
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """The volume: a file, or a folder of numbered TIFF slices; or heights (GeoTIFF, .npy, .npz, PNG of 16 bits); or a
-    SLIM surface (.npz)."""
+    SLIM surface or quadrics (.npz)."""
     header_only: Annotated[bool, arg(aliases=["-H"])] = False
     """Do not read the voxels."""
     frame: Frame = None
@@ -50,8 +52,8 @@ class Info:
     def run(self, overrides: dict[str, str]) -> None:
         from filterlab.io.heights import holds_heights
 
-        if _holds_slim(self.file):
-            _show_lines(_lines_of_slim(self.file))
+        if lines := _lines_of_surface(self.file):
+            _show_lines(lines)
         elif holds_heights(self.file):
             self._tell_heights()
         else:
@@ -82,13 +84,9 @@ class Info:
 
 
 def _show_lines(lines: Sequence[tuple[str, str]]) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(show_header=False, box=None)
+    width = max(len(name) for name, _ in lines)
     for name, value in lines:
-        table.add_row(name, Text(value))
-    show(table)
+        print(f" {name:<{width}}  {value}".rstrip())
 
 
 def _described_heights(header: HeightsHeader) -> list[tuple[str, str]]:
@@ -118,29 +116,53 @@ def _reference(header: HeightsHeader) -> str:
     return " ".join(filter(None, (header.crs_name, code and f"({code})"))) or "WKT"
 
 
-def _holds_slim(path: Path) -> bool:
+def _lines_of_surface(path: Path) -> list[tuple[str, str]]:
+    """Lines about the SLIM surface or the quadrics in an .npz file; none about any other."""
     if path.suffix.lower() != ".npz":
-        return False
+        return []
     from filterlab.io.covers import is_slim
+    from filterlab.io.quadric_files import is_quadrics
 
-    return is_slim(path)
+    return _lines_of_slim(path) if is_slim(path) else _lines_of_quadrics(path) if is_quadrics(path) else []
 
 
 def _lines_of_slim(path: Path) -> list[tuple[str, str]]:
-    """Lines about the SLIM surface in a file."""
     from filterlab.io.covers import load_slim
 
     slim = load_slim(path)
-    radii, cuts = slim.radii.double(), 0 if slim.cuts is None else slim.cuts.shape[1]
-    lower, upper = slim.domain.lower, slim.domain.upper
+    cuts = 0 if slim.cuts is None else slim.cuts.shape[1]
     return [
         ("file", f"{path} (SLIM surface)"),
         ("balls", f"{len(slim):,}, {str(slim.A.dtype).removeprefix('torch.')}"),
-        ("radii", f"{float(radii.min()):.6g} … {float(radii.max()):.6g}, median {float(radii.median()):.6g}"),
+        ("radii", _radii(slim.radii)),
         ("planes", f"up to {cuts} for each" if cuts else "none: no ball is cut"),
-        ("x, y, z", "; ".join(f"{a:.6g} … {b:.6g}" for a, b in zip(lower, upper, strict=True))),
+        ("x, y, z", _box(slim.domain)),
         ("shown", f"{slim.faces} faces, blended over {slim.offset:g} radii"),
     ]
+
+
+def _lines_of_quadrics(path: Path) -> list[tuple[str, str]]:
+    from filterlab.io.quadric_files import load_quadrics
+
+    quadrics = load_quadrics(path)
+    planes = quadrics.bounds.planes.shape[1]
+    return [
+        ("file", f"{path} (quadrics)"),
+        ("quadrics", f"{len(quadrics):,}, {str(quadrics.A.dtype).removeprefix('torch.')}"),
+        ("radii", f"{_radii(quadrics.bounds.radii)}, of what bounds them"),
+        ("planes", f"up to {planes} for each" if planes else "none: balls alone bound them"),
+        ("x, y, z", _box(quadrics.domain)),
+        ("shown", f"{quadrics.faces} faces"),
+    ]
+
+
+def _radii(radii: Tensor) -> str:
+    radii = radii.double()
+    return f"{float(radii.min()):.6g} … {float(radii.max()):.6g}, median {float(radii.median()):.6g}"
+
+
+def _box(domain: Domain) -> str:
+    return "; ".join(f"{a:.6g} … {b:.6g}" for a, b in zip(domain.lower, domain.upper, strict=True))
 
 
 def _described(header: VolumeHeader) -> list[tuple[str, str]]:
@@ -245,7 +267,7 @@ def _distribution(samples: np.ndarray, progress: Callable[[float], None]) -> lis
 def _bars(counts: list[int], low: float, span: float) -> list[tuple[str, str]]:
     """One line per bin: where it begins, its share, and a bar on a logarithmic scale (1 voxel to all of them)."""
     total, width = sum(counts), span / len(counts)
-    lines = []
+    lines = [("values", "share of all; bars are logarithmic")]
     for i, count in enumerate(counts):
         bar = "█" * (1 + round(29 * math.log(count) / max(math.log(total), 1e-9))) if count else ""
         lines.append((f"from {low + i * width:.6g}", f"{100 * count / total:6.2f} %  {bar}"))

@@ -15,7 +15,7 @@ from filterlab.cli.scenes import scene_asked_for
 
 @dataclass(frozen=True)
 class Scene:
-    """Tell what scene files may say; or show one with everything that it leaves out, or that of a volume.
+    """Tell what scene files may say; or show one with everything that it leaves out, or that of a volume or of heights.
 
     Values of a scene can be changed as for `filterlab render`, after its name.
 
@@ -23,6 +23,7 @@ class Scene:
       filterlab scene --reference
       filterlab scene engine.yaml --method notch
       filterlab scene engine.nrrd > engine.yaml
+      filterlab scene dem.tif --terrain.sun 300 15 > dem.yaml
     """
 
     scene: Annotated[Positional[Maybe[Path]], arg(metavar="SCENE.yaml | VOLUME")] = None

@@ -19,42 +19,61 @@ if TYPE_CHECKING:
 def scene_asked_for(
     path: Path, overrides: dict[str, str], output: Path | None, *, of_surface: bool = False
 ) -> tuple[Scene, Volume | None]:
-    """The scene in a file; of a SLIM surface; or of a volume, as overrides ask, its surface, greatest values or slice,
-    else as it is.
+    """The scene in a file; of a surface in a file of its own, or of heights; or of a volume, as overrides ask, its
+    surface, greatest values or slice, else as it is.
 
     With it its volume, if that has been read.
 
     Raises ValueError for one without a surface where it has to be `of_surface`, of a volume before that is read.
     """
-    from filterlab.io.covers import is_slim
-    from filterlab.scenes.build import load_scene, slim_scene, surface_scene, values_scene
+    from filterlab.scenes.build import alone_scene, load_scene, surface_scene, terrain_scene, values_scene
     from filterlab.scenes.default import default_view
 
     part = {name: overrides.pop(name) for name in ("frame", "channel") if name in overrides}
     level = overrides.pop("level", None)
     volume = None
     chosen = overrides | {f"volume.{name}": index for name, index in part.items()}
-    if is_slim(path):
+    sampled = level is not None or bool({name.partition(".")[0] for name in chosen} & {"mip", "slice", "volume"})
+    if key := _alone(path):
         if level is not None or part:
-            raise ValueError(f"expected no --level, --frame and --channel of a SLIM surface; got some: {path}")
-        scene = slim_scene(path, chosen)
+            called = {"slim": "a SLIM surface", "quadrics": "quadrics"}[key]
+            raise ValueError(f"expected no --level, --frame and --channel of {called}; got some: {path}")
+        scene = alone_scene(path, key, chosen)
+    elif level is not None and path.suffix.lower() in (".yaml", ".yml"):
+        raise ValueError(f"expected a volume with --level; got a scene, whose level is --surface.level: {path}")
     elif level is not None:
         scene = surface_scene(path, level, chosen)
     elif path.suffix.lower() in (".yaml", ".yml", "") or not path.is_file():
         scene = load_scene(path, chosen)
+    elif not sampled and not of_surface and _holds_heights(path):
+        scene = terrain_scene(path, chosen)
     elif {name.partition(".")[0] for name in chosen} & {"mip", "slice"}:
         scene = values_scene(path, chosen)
     else:
         scene, volume = (None, None) if of_surface else default_view(path, chosen)
-    if scene is None or (of_surface and scene.surface is None):
+    if scene is None or (of_surface and scene.cast is None):
         raise ValueError(f"expected a scene with a surface, or a volume and --level; got neither: {path}")
-    if of_surface and scene.slim is not None:
-        raise ValueError(f"expected a level set, of which triangles are made; got a SLIM surface: {path}")
-    source = scene.slim if scene.volume is None else scene.volume.file
-    if source is not None and output is not None:
-        check_not_input(output, Path(source))
+    if of_surface and scene.alone is not None:
+        raise ValueError(f"expected a level set, of which triangles are made; got {scene.alone}: {path}")
+    if output is not None:
+        for source in scene.sources:
+            check_not_input(output, Path(source))
     check_device(scene.device)
     return scene, volume
+
+
+def _alone(path: Path) -> str | None:
+    """The key of the surface that an .npz file holds, if it is of one."""
+    from filterlab.io.covers import is_slim
+    from filterlab.io.quadric_files import is_quadrics
+
+    return next((key for key, holds in (("slim", is_slim), ("quadrics", is_quadrics)) if holds(path)), None)
+
+
+def _holds_heights(path: Path) -> bool:
+    from filterlab.io.heights import holds_heights
+
+    return holds_heights(path)
 
 
 def split_overrides(command: type, arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:
@@ -64,7 +83,8 @@ def split_overrides(command: type, arguments: Sequence[str]) -> tuple[list[str],
 
     Raises UsageError for a key that is given twice.
     """
-    own = {f"--{f.name}": f.default is False for f in fields(command) if f.name != "scene"} | {"-o": False, "-q": True}
+    own = {f"--{f.name}": f.default is False for f in fields(command) if f.name != "scene"}
+    own |= {"-o": False, "-q": True, "--frames": False}
     known: list[str] = []
     overrides: dict[str, str] = {}
     rest = list(arguments)

@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from filterlab.cli.loading import Progress, reading
 from filterlab.cli.options import Maybe, Quiet, check_asked, check_name
 from filterlab.cli.outcome import UsageError
+from filterlab.cli.pictures import Filmed
 from filterlab.cli.saving import OutputFile
-from filterlab.cli.terminal import progress_bar, show
 from filterlab.names import SPLINES
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from filterlab.io.heights_header import HeightsHeader
-    from filterlab.render.camera import Camera
-    from filterlab.scenes.flight import Flight
-    from filterlab.scenes.terrain import Terrain as Prepared
-    from filterlab.scenes.terrain import TerrainScene
+    from filterlab.io.config import Problem
+    from filterlab.scenes.model import Scene
 
 Two = tuple[float, float]
-_SECONDS = 0.04  # for which each picture of a flight is shown
+_KEYS = {"view": "camera.compass", "size": "size", "legend": "legend", "seed": "jitter"}
+"""Options that are keys of the scene itself; all others are keys of its terrain, of the same names."""
+_OPTIONS = (
+    *("spline", "exaggeration", "sun", "view", "color", "range", "drape", "material", "sky", "water", "haze", "size"),
+    *("subpixels", "shadows", "block", "fill", "legend", "band", "unit", "seed"),
+)
+_MATERIALS: dict[str, Any] = {
+    "reflection_lines": {"kind": "reflection_lines", "axis": [1.0, 0.0, 0.0], "count": 12.0},
+    "mirror": {"kind": "environment", "reflectivity": 0.5},
+}
+"""What suits ground, where a scene may say more."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,7 @@ class Terrain:
       filterlab terrain dem.tif -o smooth.png --material reflection_lines --spline c2
       filterlab terrain dem.tif -o turn.gif --frames 60
       filterlab terrain dem.tif -o flight.gif --frames 120 --path flight.yaml
+      filterlab terrain dem.tif --water 420 --write-scene lake.yaml
     """
 
     file: Annotated[Positional[Path], arg(metavar="HEIGHTS")]
@@ -66,9 +71,9 @@ class Terrain:
     drape: Annotated[Maybe[Path], arg(metavar="PICTURE")] = None
     """A picture instead of colours: PNG or JPEG that covers the map, or a GeoTIFF with its own place."""
     material: str = "matt"
-    """Of the ground: matt; reflection_lines or mirror, which show how smooth it is."""
+    """Of the ground: matt, phong or toon; reflection_lines or mirror, which show how smooth it is."""
     sky: Annotated[Maybe[Path], arg(metavar="PICTURE")] = None
-    """What is around: an equirectangular picture; default a clear sky."""
+    """What is around: an equirectangular picture; default a clear sky, with the sun in it."""
     water: Annotated[Maybe[float], arg(metavar="LEVEL")] = None
     """The level of still water, in the unit of the heights."""
     haze: Annotated[Maybe[float], arg(metavar="METRES")] = None
@@ -85,7 +90,7 @@ class Terrain:
     """Make heights that are missing from those around."""
     legend: bool = False
     """Add the colours and their values to the picture."""
-    frames: Annotated[Maybe[int], arg(metavar="N")] = None
+    frames: Annotated[Maybe[int], arg(aliases=["--turntable"], metavar="N")] = None
     """Make N pictures: a whole turn of the camera; or along a --path."""
     path: Annotated[Maybe[Path], arg(metavar="FLIGHT.yaml")] = None
     """The points of a flight: x, y as in the file of heights, and metres above the ground (docs/terrain.md)."""
@@ -97,134 +102,60 @@ class Terrain:
     """Of the places of rays within pixels."""
     explain: bool = False
     """Show what the picture would take; no picture is made."""
+    write_scene: Annotated[Maybe[Path], arg(metavar="SCENE.yaml")] = None
+    """Write the scene that these options stand for instead of its picture, which filterlab render SCENE.yaml makes."""
     quiet: Quiet = False
     """Say nothing of what was written, and show no progress."""
 
     def run(self, overrides: dict[str, str]) -> None:
-        check_asked(self.output, self.explain, ".png")
-        if self.path is not None and self.frames is None:
-            raise UsageError("expected --frames N with --path: how many pictures the flight has")
-        if self.frames is not None and self.frames < 2:
-            raise UsageError(f"expected --frames of at least 2 pictures; got {self.frames}")
+        if self.write_scene is None:
+            check_asked(self.output, self.explain, ".png")
+        elif self.output is not None or self.explain:
+            raise UsageError("expected --write-scene without -o and --explain: the scene makes the same picture")
+        elif self.write_scene.suffix.lower() not in (".yaml", ".yml"):
+            raise UsageError(f"expected a name that ends in .yaml for a scene; got {self.write_scene}")
+        filmed = Filmed(self.frames, self.path)
         check_name("spline", self.spline, SPLINES)
-        output = None if self.output is None else self._output(self.output)
+        sources = (self.file, self.drape, self.sky)
+        if self.write_scene is not None:
+            self._write_scene(self.write_scene, OutputFile.at(self.write_scene, *sources, quiet=self.quiet))
+            return
+        output = None if self.output is None else filmed.output(self.output, *sources, quiet=self.quiet)
+        filmed.make(self._scene(), None, output, self.quiet)
 
-        from filterlab.io.heights import MAX_BYTES, describe_heights
+    def _write_scene(self, path: Path, output: OutputFile) -> None:
+        from filterlab.io.atomic import atomic_write
+        from filterlab.io.config import dump_config
 
-        header = describe_heights(self.file, band=self.band)
-        scene, flight = self._scene(), self._flight()
-        with progress_bar(self.quiet) as progress:
-            prepared = _prepared(scene, header, MAX_BYTES, progress)
-            if output is not None:
-                pictures = _Pictures(prepared, self._cameras(prepared, flight), self.legend, progress)
-                self._write(pictures, output.path)
-        if output is None:
-            show(_explained(prepared, header, self.frames or 1))
-        else:
-            output.tell(pictures.told)  # pyright: ignore[reportPossiblyUnboundVariable]
+        text = dump_config(self._scene(), brief=True)
+        with atomic_write(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        output.tell(f"the scene of {self.file}; filterlab render {path} makes the picture")
 
-    def _output(self, output: Path) -> OutputFile:
-        from filterlab.io.picture_formats import ANIMATIONS, PICTURES, format_of
+    def _scene(self) -> Scene:
+        """The scene of these options. Raises ConfigError that tells of them by their names here."""
+        import json
 
-        sources = (self.file, self.drape, self.sky, self.path)
-        if self.frames is not None and not output.suffix:
-            return OutputFile.folder(output, *sources, quiet=self.quiet)
-        format_of(output, PICTURES if self.frames is None else ANIMATIONS)
-        return OutputFile.at(output, *sources, quiet=self.quiet)
+        from pydantic_core import to_jsonable_python
 
-    def _scene(self) -> TerrainScene:
-        from filterlab.scenes.terrain import TerrainScene, scene_of
+        from filterlab.io.config import ConfigError
+        from filterlab.scenes.build import terrain_scene
 
-        asked = {name: getattr(self, name) for name in TerrainScene.model_fields if hasattr(self, name)}
-        return scene_of(asked)
-
-    def _flight(self) -> Flight | None:
-        if self.path is None:
-            return None
-        from filterlab.scenes.flight import load_flight
-
-        return load_flight(self.path)
-
-    def _cameras(self, prepared: Prepared, flight: Flight | None) -> list[Camera]:
-        if self.frames is None:
-            return [prepared.camera]
-        return prepared.around(self.frames) if flight is None else flight.cameras(prepared, self.frames)
-
-    def _write(self, pictures: _Pictures, output: Path) -> None:
-        from filterlab.cli.pictures import write_pictures
-
-        write_pictures(pictures, output, moving=self.frames is not None, seconds=_SECONDS)
+        keys = {name: _KEYS.get(name, f"terrain.{name}") for name in _OPTIONS}
+        given = {name: getattr(self, name) for name in _OPTIONS}
+        given["material"] = _MATERIALS.get(self.material, self.material)
+        given["legend"] = self.legend or None
+        asked = {keys[name]: json.dumps(to_jsonable_python(v)) for name, v in given.items() if v is not None}
+        try:
+            return terrain_scene(self.file, asked)
+        except ConfigError as error:
+            raise ConfigError(_named(problem, keys) for problem in error.problems) from None
 
 
-def _prepared(scene: TerrainScene, header: HeightsHeader, max_bytes: int, progress: Progress) -> Prepared:
-    from filterlab.scenes.terrain import Terrain
-
-    with reading(progress):
-        heights = header.read(max_bytes)
-    return Terrain.of(scene, heights)
-
-
-@dataclass
-class _Pictures:
-    """The pictures of all cameras, one after the other; progress is told of.
-
-    Attributes:
-        told: what was made, when it is.
-    """
-
-    prepared: Prepared
-    cameras: list[Camera]
-    legend: bool
-    progress: Progress
-    told: str = ""
-
-    def __len__(self) -> int:
-        return len(self.cameras)
-
-    def __iter__(self) -> Iterator[Tensor]:
-        count = len(self.cameras)
-        for k, camera in enumerate(self.cameras):
-            what = "rendering" if count == 1 else f"rendering {k + 1} of {count}"
-            image = self._with_legend(self.prepared.render(self._part(k, what), camera))
-            many = "" if count == 1 else f"{count} pictures of "
-            high = f"{self.prepared.exaggeration:g} times as high as it is"
-            self.told = f"{many}{image.shape[1]} × {image.shape[0]} pixels, 8-bit RGB, {high}"
-            yield image
-
-    def _with_legend(self, image: Tensor) -> Tensor:
-        legend = self.prepared.legend if self.legend else None
-        return image if legend is None else legend.beside(image, (1.0, 1.0, 1.0))
-
-    def _part(self, k: int, what: str) -> Callable[[int, int], None]:
-        return lambda done, total: self.progress((k + done / max(total, 1)) / len(self.cameras), what)
-
-
-def _explained(prepared: Prepared, header: HeightsHeader, pictures: int) -> object:
-    """A table of what a picture takes, and of what was not asked for."""
-    from rich.table import Table
-    from rich.text import Text
-
-    scene, heights = prepared.scene, prepared.heights
-    (dx, dy), (width, height) = heights.spacing, scene.size
-    left, bottom, right, top = heights.extent
-    low, high = prepared.span
-    missing = int(heights.missing.sum())
-    rays = width * height * scene.subpixels**2
-    columns, rows = prepared.surface.cells
-    lines = [
-        ("heights", f"{heights.size[0]} × {heights.size[1]}, {header.nbytes / 2**20:.4g} MiB, {heights.samples.dtype}"),
-        ("missing", f"{missing}, {'made from those around' if scene.fill else 'holes'}" if missing else "none"),
-        ("spacing", f"{abs(dx):.6g} × {abs(dy):.6g} m"),
-        ("extent", f"{(right - left) / 1000:.4g} × {(top - bottom) / 1000:.4g} km"),
-        ("height", f"{low:.6g} … {high:.6g}, but for ½ % at either end"),
-        ("spline", f"{scene.spline}, {columns} × {rows} cells of two quartics"),
-        ("exaggeration", f"{prepared.exaggeration:g}" + ("" if scene.exaggeration else ", as the relief suggests")),
-        ("camera", f"looks to {scene.view[0]:g}° from north, {scene.view[1]:g}° down"),
-        ("sun", f"{scene.sun[0]:g}° from north, {scene.sun[1]:g}° high" + (", casts shadows" if scene.shadows else "")),
-        ("picture", f"{width} × {height} pixels, {scene.subpixels**2} rays each: {rays / 1e6:.3g} million"),
-        *([("pictures", str(pictures))] if pictures > 1 else []),
-    ]
-    table = Table(show_header=False, box=None)
-    for name, value in lines:
-        table.add_row(name, Text(value))
-    return table
+def _named(problem: Problem, keys: Mapping[str, str]) -> Problem:
+    """The same, of the option that the key is set by."""
+    for name, key in keys.items():
+        if problem.place == f"--{key}":
+            path = problem.path.removeprefix(key.rpartition(".")[0]).removeprefix(".")
+            return replace(problem, place=f"--{name}", path=path if name not in _KEYS else "")
+    return problem

@@ -18,10 +18,10 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from filterlab.ops.bounds import Codes
-from filterlab.ops.differentiable.bounds import bounds
+from filterlab.ops.differentiable.bounds import bits_of_blocks, bounds
+from filterlab.ops.differentiable.raycast import marks_of_bits
 from filterlab.ops.pieces import Lattice
-from filterlab.ops.raycast import bits_of_blocks, marks_of_bits
-from filterlab.ops.reference.bounds import layers_of, weights_of
+from filterlab.ops.reference.bounds import layers_of, straddle, weights_of
 from filterlab.ops.tetrahedra import AnyLattice, TetrahedralLattice
 
 _MANY = 1 << 25  # cells from which on bricks have edges of 4, not 2
@@ -57,14 +57,11 @@ class Blocks:
 
     def straddling(self, below: int, above: int) -> Tensor:
         """(pz, py, px): which parts have codes on both sides, or between."""
-        return self.in_order(_straddle(self.low, self.high, below, above), self.shape)
+        return self.in_order(straddle(self.low, self.high, below, above), self.shape)
 
     def bits(self, below: int, above: int) -> Tensor:
         """`ops.raycast.bits_of` the same, (bz, by, bx); of other blocks than straddle as a whole no part is read."""
-        (some,) = _straddle(self.least, self.most, below, above).nonzero(as_tuple=True)
-        bits = self.low.new_zeros((len(self.low), *(_EDGE // 2,) * 3), dtype=torch.uint8)
-        low, high = self.low.index_select(0, some), self.high.index_select(0, some)
-        bits.index_copy_(0, some, bits_of_blocks(_straddle(low, high, below, above)))
+        bits = bits_of_blocks(self.low, self.high, self.least, self.most, below, above)
         z, y, x = (-(-n // 2) for n in self.shape)
         return self.in_order(bits.view(torch.int32), (z, y, -(-x // 4))).view(torch.uint8)[..., :x].contiguous()
 
@@ -82,12 +79,6 @@ def _in_blocks(codes: Tensor, blocks: tuple[int, int, int], empty: int) -> Tenso
     z, y, x = blocks
     whole = torch.nn.functional.pad(codes, pad, value=empty).view(z, _EDGE, y, _EDGE, x, _EDGE)
     return whole.permute(0, 2, 4, 1, 3, 5).reshape(-1, _EDGE, _EDGE, _EDGE)
-
-
-def _straddle(low: Tensor, high: Tensor, below: int, above: int) -> Tensor:
-    if low.device.type == "cpu":  # numpy compares short integers in a tenth of torch's time
-        return torch.from_numpy((low.numpy() <= above) & (high.numpy() >= below))
-    return (low <= above) & (high >= below)
 
 
 @dataclass(frozen=True)

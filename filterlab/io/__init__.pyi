@@ -6,6 +6,7 @@ from .covers import is_slim, load_slim, save_slim
 from .heights import HEIGHT_FORMATS, describe_heights, load_heights, save_heights
 from .images import load_image, save_animation, save_image
 from .meshes import MESH_FORMATS, load_mesh, save_mesh
+from .molecules import load_molecule
 from .points import load_points
 from .quadric_files import is_quadrics, load_quadrics, save_quadrics
 from .volumes import FORMATS, describe, load_volume, save_volume
@@ -30,6 +31,7 @@ __all__ = [
     "load_heights",
     "load_image",
     "load_mesh",
+    "load_molecule",
     "load_points",
     "load_quadrics",
     "load_slim",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import re
-import secrets
 import shutil
 import time
 from collections.abc import Iterator
@@ -72,7 +71,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     check_writable(path)
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".tmp-{secrets.token_hex(8)}{''.join(target.suffixes[-2:])}")
+    temporary = target.with_name(f".tmp-{os.urandom(8).hex()}{''.join(target.suffixes[-2:])}")
     try:
         yield temporary
         _flush(temporary)
@@ -92,7 +91,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         OSError: as `check_new_folder` (before the block runs), or the block's own error.
     """
     target = Path(os.path.realpath(check_new_folder(path)))
-    temporary = target.with_name(f".tmp-{secrets.token_hex(8)}")
+    temporary = target.with_name(f".tmp-{os.urandom(8).hex()}")
     temporary.mkdir()
     try:
         yield temporary

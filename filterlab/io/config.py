@@ -101,9 +101,22 @@ def loads_config(
     return _validated(document, model, Path())
 
 
-def dump_config(config: BaseModel) -> str:
-    """A YAML text that `load_config` reads back to an equal model. Raises ValueError on numbers that are not finite."""
-    return dump_data(config.model_dump(mode="json"))
+def loads_data(data: Any, model: type[Model], overrides: Mapping[str, str] | None = None, *, name: str) -> Model:
+    """As `loads_config`, of plain data that stand in no file, so that mistakes in them are told of without a line."""
+    document = _parse(dump_data(data), name)
+    document.places = dict.fromkeys(document.places, name)
+    for key, value in (overrides or {}).items():
+        _override(document, model, key, value)
+    return _validated(document, model, Path())
+
+
+def dump_config(config: BaseModel, *, brief: bool = False) -> str:
+    """A YAML text that `load_config` reads back to an equal model. Raises ValueError on numbers that are not finite.
+
+    Args:
+        brief: leave out what nobody said.
+    """
+    return dump_data(config.model_dump(mode="json", exclude_unset=brief))
 
 
 def dump_data(data: Any) -> str:
@@ -427,6 +440,8 @@ def _problem(document: _Document, model: type[BaseModel], details: Any) -> Probl
         message = unknown_name("name", shown, names) if isinstance(shown, str) and names else _expected(message, value)
     elif kind == "union_tag_not_found":
         message = f"expected the key {context.get('discriminator')}, which tells the kind; it is missing"
+    elif kind in ("tuple_type", "list_type"):
+        message = _expected("Input should be a list, [ … ]", value)
     elif kind in ("value_error", "assertion_error"):
         message = str(context.get("error", message))
     else:

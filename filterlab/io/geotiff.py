@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from affine import Affine
     from rasterio import DatasetReader
 
-SUFFIXES = (".tif", ".tiff")
 DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".asc": "AAIGrid", ".hgt": "SRTMHGT"}
 """Endings of what rasterio reads here, and GDAL's name of the driver."""
 
@@ -189,7 +188,7 @@ def _read(path: Path, number: int, high: int, scaling: tuple[float, float], samp
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def write(heights: Heights, path: Path, stored: str | None) -> None:
+def write(heights: Heights, path: Path, stored: str | None, _final: Path | None = None) -> None:
     """Deflated, in tiles of 256² (strips, where it is smaller), samples in the middle of pixels ("point")."""
     require_rasterio(path)
     import rasterio

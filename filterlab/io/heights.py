@@ -7,46 +7,56 @@ has none. Rows stay in the order of the file: from the north in most, so that th
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from filterlab.heights import Heights
-from filterlab.io import geotiff, heights_numpy, heights_png, tiff_pages
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import VolumeFileError, regular_file
-from filterlab.io.heights_header import HeightsHeader
+from filterlab.io.formats import Format, function
 from filterlab.names import unknown_name
+
+if TYPE_CHECKING:
+    from filterlab.heights import Heights
+    from filterlab.io.heights_header import HeightsHeader
 
 MAX_BYTES = 2**33  # that heights may take in memory, where nobody says otherwise
 
 
 @dataclass(frozen=True)
-class HeightFormat:
-    """A format of heights: endings, how its header is read, how it is written (None: read only)."""
+class HeightFormat(Format):
+    """A format of heights.
 
-    name: str
-    endings: tuple[str, ...]
-    read_header: Callable[..., HeightsHeader]
-    write: Callable[..., None] | None = None
+    Attributes:
+        banded: whether a file may hold several bands.
+        holds_heights: `module.function` that tells a file of heights from one of a volume; None: it is one.
+    """
+
     banded: bool = False
+    holds_heights: str | None = None
 
 
 HEIGHT_FORMATS: dict[str, HeightFormat] = {
     known.name: known
     for known in (
+        HeightFormat("GeoTIFF", (".tif", ".tiff"), "geotiff.read_header", "geotiff.write", True, "tiff_pages.is_map"),
         HeightFormat(
-            "GeoTIFF",
-            geotiff.SUFFIXES,
-            geotiff.read_header,
-            lambda heights, path, stored, final: geotiff.write(heights, path, stored),
-            banded=True,
+            "npy",
+            (".npy",),
+            "heights_numpy.read_npy_header",
+            "heights_numpy.write_npy",
+            holds_heights="heights_numpy.is_npy_of_heights",
         ),
-        HeightFormat("npy", (".npy",), heights_numpy.read_npy_header, heights_numpy.write_npy),
-        HeightFormat("npz", (".npz",), heights_numpy.read_npz_header, heights_numpy.write_npz),
-        HeightFormat("PNG", (".png",), heights_png.read_header, heights_png.write),
-        HeightFormat("Arc/Info ASCII grid", (".asc",), geotiff.read_header),
-        HeightFormat("SRTM", (".hgt",), geotiff.read_header),
+        HeightFormat(
+            "npz",
+            (".npz",),
+            "heights_numpy.read_npz_header",
+            "heights_numpy.write_npz",
+            holds_heights="heights_numpy.is_npz_of_heights",
+        ),
+        HeightFormat("PNG", (".png",), "heights_png.read_header", "heights_png.write"),
+        HeightFormat("Arc/Info ASCII grid", (".asc",), "geotiff.read_header"),
+        HeightFormat("SRTM", (".hgt",), "geotiff.read_header"),
     )
 }
 
@@ -116,11 +126,11 @@ def save_heights(heights: Heights, path: str | os.PathLike[str], *, stored: str 
     """
     path = Path(path)
     known = format_of(path)
-    if known.write is None:
-        endings = [ending for one in HEIGHT_FORMATS.values() if one.write for ending in one.endings]
+    if known.writer is None:
+        endings = [ending for one in HEIGHT_FORMATS.values() if one.writer for ending in one.endings]
         raise VolumeFileError(path, f"a name that ends in {', '.join(endings)}", repr(path.suffix))
     if known.name == "GeoTIFF":
-        geotiff.require_rasterio(path)
+        function("geotiff.require_rasterio")(path)
     with atomic_write(path) as temporary:
         try:
             known.write(heights, temporary, stored, path)
@@ -134,16 +144,11 @@ def holds_heights(path: str | os.PathLike[str]) -> bool:
     A TIFF of one page does, and one with tags of a map; of NumPy files those with two axes.
     """
     path = Path(path)
-    if not path.is_file():
+    named = (known for known in HEIGHT_FORMATS.values() if path.name.lower().endswith(known.endings))
+    known = next(named, None)
+    if known is None or not path.is_file():
         return False
-    ending = path.suffix.lower()
-    look = {
-        **dict.fromkeys((".png", ".asc", ".hgt"), lambda _: True),
-        **dict.fromkeys(geotiff.SUFFIXES, tiff_pages.is_map),
-        ".npy": heights_numpy.is_npy_of_heights,
-        ".npz": heights_numpy.is_npz_of_heights,
-    }.get(ending)
     try:
-        return look is not None and look(path)
+        return known.holds_heights is None or function(known.holds_heights)(path)
     except VolumeFileError:
         return False

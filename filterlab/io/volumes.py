@@ -14,14 +14,14 @@ trip through any format that is written keeps the affine bit for bit, but NIfTI-
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from filterlab.io import itk, nifti, nrrd, numpy_files, raw, tiff
+from filterlab.io import itk
 from filterlab.io.atomic import atomic_write
 from filterlab.io.bounded import VolumeFileError, VolumeHeader, beside, regular_file
+from filterlab.io.formats import Format, function
 from filterlab.names import unknown_name
 
 if TYPE_CHECKING:
@@ -29,32 +29,30 @@ if TYPE_CHECKING:
 
     from filterlab.volume import Volume
 
-Writer = Callable[..., None]
-
 MAX_BYTES = 2**33  # that samples may take in memory, where nobody says otherwise
 
 
 @dataclass(frozen=True)
-class VolumeFormat:
-    """A volume format: endings of its files, how its header is read, how a volume is written (None: read only)."""
+class VolumeFormat(Format):
+    """A volume format.
 
-    name: str
-    endings: tuple[str, ...]
-    read_header: Callable[..., VolumeHeader]
-    write: Writer | None = None
+    Attributes:
+        written: endings under which volumes are written.
+    """
+
     written: tuple[str, ...] = ()
 
 
 FORMATS: dict[str, VolumeFormat] = {
     known.name: known
     for known in (
-        VolumeFormat("NRRD", (".nrrd", ".nhdr"), nrrd.read_header, nrrd.write, (".nrrd",)),
-        VolumeFormat("NIfTI", (".nii", ".nii.gz"), nifti.read_header, nifti.write, (".nii", ".nii.gz")),
-        VolumeFormat("TIFF", tiff.SUFFIXES, tiff.read_header),
-        VolumeFormat("npy", (".npy",), numpy_files.read_npy_header, numpy_files.write_npy, (".npy",)),
-        VolumeFormat("npz", (".npz",), numpy_files.read_npz_header, numpy_files.write_npz, (".npz",)),
-        VolumeFormat("raw", (".raw", ".raw.yaml"), raw.read_header),
-        VolumeFormat("ITK", itk.SUFFIXES, itk.read_header),
+        VolumeFormat("NRRD", (".nrrd", ".nhdr"), "nrrd.read_header", "nrrd.write", (".nrrd",)),
+        VolumeFormat("NIfTI", (".nii", ".nii.gz"), "nifti.read_header", "nifti.write", (".nii", ".nii.gz")),
+        VolumeFormat("TIFF", (".tif", ".tiff"), "tiff.read_header"),
+        VolumeFormat("npy", (".npy",), "numpy_files.read_npy_header", "numpy_files.write_npy", (".npy",)),
+        VolumeFormat("npz", (".npz",), "numpy_files.read_npz_header", "numpy_files.write_npz", (".npz",)),
+        VolumeFormat("raw", (".raw", ".raw.yaml"), "raw.read_header"),
+        VolumeFormat("ITK", itk.SUFFIXES, "itk.read_header"),
     )
 }
 
@@ -97,7 +95,7 @@ def check_saveable(path: str | os.PathLike[str], *, batched: bool = False, nifti
     if nifti2 and name != "NIfTI":
         raise VolumeFileError(path, f"a name that ends in {' or '.join(FORMATS['NIfTI'].written)} for NIfTI-2", name)
     if name == "NIfTI":
-        nifti.require_nibabel(path)
+        function("nifti.require_nibabel")(path)
     return path
 
 
@@ -106,6 +104,8 @@ def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:
 
     Raises as `describe`, for what it reads of them.
     """
+    from filterlab.io import numpy_files, raw, tiff
+
     path = Path(path)
     name, found = format_of(path).name, [path]
     if name == "ITK":
@@ -201,7 +201,6 @@ def save_volume(
     volume = as_volume(volume)
     path = check_saveable(path, batched=volume.batched, nifti2=nifti2)
     known = format_of(path)
-    assert known.write is not None
     options = {"nifti2": nifti2} if known.name == "NIfTI" else {}
     with atomic_write(path) as temporary:
         try:
@@ -209,4 +208,4 @@ def save_volume(
         except VolumeFileError as error:  # name the file that was asked for, not the temporary one
             raise VolumeFileError(path, error.expected, error.got) from None
         if path.name.lower().endswith(".npy"):
-            numpy_files.write_sidecar(volume, path)
+            function("numpy_files.write_sidecar")(volume, path)

@@ -42,15 +42,15 @@ def raised(order: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     )
 
 
-def differences(i: int, j: int) -> dict[int, int]:
-    """∂^i along λ1 and ∂^j along λ2 of degree 4, of what is left after 4 − r steps, r = i + j ≤ 4:
+def differences(i: int, j: int, degree: int = DEGREE) -> dict[int, int]:
+    """∂^i along λ1 and ∂^j along λ2 of degree n, of what is left after n − r steps, r = i + j ≤ n:
 
-    4!/(4 − r)! (e_1 − e_0)^i (e_2 − e_0)^j, in which e_α stands for the coefficient c_α. Place -> weight.
+    n!/(n − r)! (e_1 − e_0)^i (e_2 − e_0)^j, in which e_α stands for the coefficient c_α. Place -> weight.
     """
     order = i + j
     place = {alpha: n for n, alpha in enumerate(multi_indices(order, 2))}
     return {
-        place[order - p - q, p, q]: perm(DEGREE, order) * comb(i, p) * comb(j, q) * (-1) ** (order - p - q)
+        place[order - p - q, p, q]: perm(degree, order) * comb(i, p) * comb(j, q) * (-1) ** (order - p - q)
         for p in range(i + 1)
         for q in range(j + 1)
     }
@@ -104,6 +104,11 @@ class Pattern:
     def offsets(self) -> tuple[tuple[int, int], ...]:
         """(a, b) of the data of `up`: a steps from V0 towards V1, b towards V2; the same of both triangles."""
         return tuple((self.steps - a if self.mirrored else a, b) for a, b in self.up.samples)
+
+    @property
+    def degree(self) -> int:
+        """The lowest that its polynomials have: three data make a plane."""
+        return 1 if len(self.up.samples) == 3 else DEGREE
 
     @cached_property
     def reach(self) -> int:
@@ -182,13 +187,18 @@ def _places(boundary: Boundary, n: int, steps: int, reach: int, stride: int) -> 
 
 
 class Masks:
-    """The arithmetic of one triangle: data to coefficients to derivatives, and all of it transposed."""
+    """The arithmetic of one triangle: data to coefficients to derivatives, and all of it transposed.
+
+    Coefficients are those of the pattern's degree: of a plane the three at the corners.
+    """
 
     def __init__(self, arithmetic: Arithmetic, pattern: Pattern) -> None:
-        self.arithmetic, self.weights, self.first = arithmetic, pattern.up.weights, pattern.up.first
+        self.arithmetic, self.first, self.degree = arithmetic, pattern.up.first, pattern.degree
+        kept = [n for n, alpha in enumerate(multi_indices(DEGREE, 2)) if self.degree == DEGREE or DEGREE in alpha]
+        self.weights = [pattern.up.weights[n] for n in kept]
 
     def coefficients(self, data: Sequence[Value]) -> list[Value]:
-        """The 15 coefficients."""
+        """All of a triangle."""
         e = self.arithmetic
         found = []
         for weights in self.weights:
@@ -201,16 +211,17 @@ class Masks:
     def derivatives(self, coefficients: list[Value], barycentric: Sequence[Value], order: int) -> list[Value]:
         """All rows of a jet, along λ1 and λ2."""
         found: list[Value] = []
-        for degree in range(DEGREE, -1, -1):
+        for degree in range(self.degree, -1, -1):
             if degree <= order:
                 found = [*(self._difference(coefficients, *row) for row in rows(degree) if sum(row) == degree), *found]
             if degree:
                 coefficients = self._step(coefficients, barycentric, degree)
-        return found
+        nothing = self.arithmetic.multiply(found[0], self.arithmetic.constant(0))  # NaN in holes
+        return found + [nothing] * (len(rows(order)) - len(found))
 
     def _difference(self, coefficients: Sequence[Value], i: int, j: int) -> Value:
         e, total = self.arithmetic, None
-        for place, weight in differences(i, j).items():
+        for place, weight in differences(i, j, self.degree).items():
             total = e.multiply_add(coefficients[place], e.constant(weight), total)
         return total
 
@@ -228,12 +239,12 @@ class Masks:
         """Of every datum what the rows of a jet give it."""
         e, left = self.arithmetic, list(cotangents)
         coefficients: list[Value | None] = []
-        for degree in range(DEGREE + 1):
+        for degree in range(self.degree + 1):
             coefficients = self._step_back(coefficients, barycentric, degree) if degree else [None]
             if degree <= order:
                 for row in [row for row in rows(degree) if sum(row) == degree]:
                     own = left.pop(0)
-                    for place, weight in differences(*row).items():
+                    for place, weight in differences(*row, self.degree).items():
                         coefficients[place] = e.multiply_add(own, e.constant(weight), coefficients[place])
         return [self._sum(coefficients, column) for column in zip(*self.weights, strict=True)]
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,7 +26,7 @@ JUMP, REPEATED = 1, 2  # bits of `Written.flags`
 PASSES = 120  # of Newton's method and bisection
 USUAL = 2  # passes before a value that may be rounding decides anything
 
-_RADII = (1, 2, 3, 4, 5, 6, 7, 8)  # bricks around an empty one that are told to be empty as well
+RADII = (1, 2, 3, 4, 5, 6, 7, 8)  # bricks around an empty one that are told to be empty as well
 _FEW = 4  # candidates of a ray at first; those with more are cast again
 _NUMBERS_AT_ONCE = 1 << 24  # of candidates
 
@@ -155,42 +154,16 @@ def bits_of(parts: Tensor) -> Tensor:
     return bits
 
 
-def bits_of_blocks(parts: Tensor) -> Tensor:
-    """`bits_of` (K, 8, 8, 8) parts, which lie together; on a CPU by bytes of eight parts along x."""
-    if parts.device.type != "cpu":
-        return bits_of(parts)
-    rows = np.packbits(parts.numpy().reshape(-1), bitorder="little")
-    fours = _PAIRS.take(rows).reshape(-1, 4, 2, 4, 2)  # a byte for each of four bricks
-    found = fours[:, :, 0, :, 0].copy()
-    for z, y in ((0, 1), (1, 0), (1, 1)):
-        found |= fours[:, :, z, :, y] << np.uint32(4 * z + 2 * y)
-    return torch.from_numpy(found.view(np.uint8).reshape(-1, 4, 4, 4))
-
-
-_PAIRS = np.stack([np.arange(256) >> shift & 3 for shift in (0, 2, 4, 6)], -1).astype(np.uint8).view(np.uint32)[:, 0]
-"""Of eight bits, two in each of four bytes."""
-
-
 def marks_of_bits(bits: Tensor) -> Tensor:
     """`Raycast.marks` from (bz, by, bx) uint8 of `bits_of`."""
-    clear = _clear_of(bits > 0)  # either is 0
-    if bits.device.type == "cpu":  # numpy makes no arrays of 16 bits of both before
-        return torch.from_numpy(np.subtract(bits.numpy(), clear.numpy(), dtype=np.int16))
-    return bits.to(torch.int16) - clear
-
-
-def _clear_of(relevant: Tensor) -> Tensor:
-    """(bz, by, bx) uint8: 0 for bricks that may hold the level, else 1 + r as in `Raycast.marks`, for r of `_RADII`."""
-    if relevant.device.type == "cpu":
-        return torch.from_numpy(_clear_in_words(relevant.numpy()))
-    near = relevant.to(torch.uint8)
-    clear, reach = 1 - near, 0
-    for radius in _RADII:  # within 2 k is within k of what is within k
+    near, reach = (bits > 0).to(torch.uint8), 0
+    clear = 1 - near  # 1 + r, where no brick within r may hold the level
+    for radius in RADII:  # within 2 k is within k of what is within k
         for dim in range(3):
             near = _spread(near, dim, radius - reach)
         clear += (1 - near) * (radius - reach)
         reach = radius
-    return clear
+    return bits.to(torch.int16) - clear
 
 
 def _spread(mask: Tensor, dim: int, by: int) -> Tensor:
@@ -199,37 +172,4 @@ def _spread(mask: Tensor, dim: int, by: int) -> Tensor:
     if kept > 0:
         out.narrow(dim, by, kept).bitwise_or_(mask.narrow(dim, 0, kept))
         out.narrow(dim, 0, kept).bitwise_or_(mask.narrow(dim, by, kept))
-    return out
-
-
-def _clear_in_words(relevant: np.ndarray) -> np.ndarray:
-    """`_clear_of`, of 64 bricks along x at a time, a bit each."""
-    packed = np.packbits(relevant, axis=-1, bitorder="little")
-    near = np.pad(packed, ((0, 0), (0, 0), (0, -packed.shape[-1] % 8))).view(np.uint64)
-    clear = [~near]  # within 0, 1, … bricks: each of these leaves out more than the one before
-    for _ in _RADII:
-        near = _spread_by_one(near)
-        clear.append(~near)
-    counts = np.zeros(relevant.shape, np.uint8)
-    for place in reversed(range(len(clear).bit_length())):  # the bits of how many leave out a brick
-        size, bit = 1 << place, np.zeros_like(near)
-        for first in range(size - 1, len(clear), 2 * size):
-            bit |= clear[first] & ~clear[first + size] if first + size < len(clear) else clear[first]
-        own = np.unpackbits(bit.view(np.uint8), axis=-1, count=relevant.shape[-1], bitorder="little")
-        counts += counts
-        counts |= own
-    return counts
-
-
-def _spread_by_one(words: np.ndarray) -> np.ndarray:
-    """Bits, and those before and behind them along x, y and z."""
-    one, last = np.uint64(1), np.uint64(63)
-    out = words | (words << one) | (words >> one)
-    out[..., 1:] |= words[..., :-1] >> last
-    out[..., :-1] |= words[..., 1:] << last
-    for axis in (0, 1):
-        rows, spread = out.swapaxes(0, axis), out.copy().swapaxes(0, axis)
-        spread[1:] |= rows[:-1]
-        spread[:-1] |= rows[1:]
-        out = spread.swapaxes(0, axis)
     return out

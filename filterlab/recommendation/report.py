@@ -38,21 +38,23 @@ def sentences(found: Recommendation) -> list[str]:
     chosen = found.chosen
     if found.pick is not None:
         lines.append(f"Recommended: {_named(chosen)}, {_interval(chosen)} for a budget of {percent(found.max_error)}.")
-    else:
-        lines.append(f"Nothing surely meets the budget: {_why_not(found)}")
-        lines.append(f"The most accurate: {_named(chosen)}, {_interval(chosen)}.")
         if chosen.error.high > found.max_error:
+            lines.append("The interval reaches beyond the budget: so near to it, it is kept in nine of ten cases.")
+    else:
+        lines.append(f"Nothing is likely to meet the budget: {_why_not(found)}")
+        lines.append(f"The most accurate: {_named(chosen)}, {_interval(chosen)}.")
+        if chosen.error.likely > found.max_error:
             lines.append(f"What would help: {_help(found)}.")
     return lines
 
 
 def _help(found: Recommendation) -> str:
     """Which budget would be met, and what to change for a smaller one."""
-    ways = [f"a budget of {_percent_above(found.best.error.high)}, which that one keeps"]
-    if found.task != "resample" and found.of_value.high <= found.max_error:
+    ways = [f"a budget of {_percent_above(found.best.error.likely)}, which that one most likely keeps"]
+    if found.task != "resample" and found.of_value.likely <= found.max_error:
         ways.append(
-            "to count the value alone, as task resample does: the gradient is what is off, the value is within "
-            f"{_percent_above(found.of_value.high)}"
+            "to count the value alone, as task resample does: the gradient is what is off, the value is likely within "
+            f"{_percent_above(found.of_value.likely)}"
         )
     if found.best.resolved:
         ways.append("finer voxels")
@@ -65,7 +67,7 @@ def _help(found: Recommendation) -> str:
 
 
 def _why_not(found: Recommendation) -> str:
-    accurate = [c for c in found.candidates if c.error.high <= found.max_error]
+    accurate = [c for c in found.candidates if c.error.likely <= found.max_error]
     if found.undecided and not accurate:
         return "some error may be within it, but the samples do not tell."
     if not accurate:

@@ -211,6 +211,7 @@ class PerspectiveCamera(Camera):
         field_of_view: float = 25.0,
         aspect: float = 1.0,
         margin: float = 1.05,
+        window: Window = WHOLE,
     ) -> Self:
         """The camera with world points (M, 3) in view, as near as it can be, and them in the middle.
 
@@ -218,7 +219,7 @@ class PerspectiveCamera(Camera):
         """
         points = _vector(points).cpu()
         seen = _Seen.of(points, direction, up, aspect, margin).centered(_half_height(field_of_view))
-        return cls._of(seen, up, field_of_view)
+        return cls._of(seen, up, field_of_view, window)
 
     @classmethod
     def _of(cls, seen: _Seen, up: Vector, field_of_view: float, window: Window = WHOLE) -> Self:
@@ -268,9 +269,38 @@ class OrthographicCamera(Camera):
     ) -> Self:
         """The camera looking along `direction` with all of `domain` in view; arguments as for the perspective one."""
         seen = _Seen.of(domain.corners(), direction, up, aspect, margin)
-        position = seen.center - domain.diagonal * seen.forward
-        target = seen.center.tolist()
-        return cls(position=position.tolist(), target=target, up=up, window=window, height=2 * float(seen.reach.max()))
+        return cls._of(seen, up, window, domain.diagonal)
+
+    @classmethod
+    def of_points(
+        cls,
+        points: Array,
+        direction: Vector,
+        *,
+        up: Vector = (0.0, 0.0, 1.0),
+        aspect: float = 1.0,
+        margin: float = 1.05,
+        window: Window = WHOLE,
+    ) -> Self:
+        """The camera with world points (M, 3) in view, as large as can be, and them in the middle.
+
+        Raises ValueError as `framing`.
+        """
+        points = _vector(points).cpu()
+        seen = _Seen.of(points, direction, up, aspect, margin)
+        low, high = seen.points.aminmax(dim=0)
+        return cls._of(seen.about((low + high) / 2), up, window, float((high - low).norm()) or 1.0)
+
+    @classmethod
+    def _of(cls, seen: _Seen, up: Vector, window: Window, distance: float) -> Self:
+        """From a distance at which all of it is in front."""
+        return cls(
+            position=(seen.center - distance * seen.forward).tolist(),
+            target=seen.center.tolist(),
+            up=up,
+            window=window,
+            height=2 * float(seen.reach.max()) or 1.0,
+        )
 
 
 def _half_height(field_of_view: float) -> float:

@@ -180,7 +180,9 @@ class _Edges(NamedTuple):
     bound: Tensor
 
     def some(self, which: Tensor) -> _Edges:
-        return _Edges(self.lines.some(which), *(None if field is None else field[which] for field in self[1:]))
+        piece = None if self.piece is None else self.piece[which]
+        fields = {name: getattr(self, name)[which] for name in self._fields if name not in ("lines", "piece")}
+        return _Edges(self.lines.some(which), piece=piece, **fields)
 
 
 def swept(how: Silhouettes, eye: Eye, pixels: Tensor, seed: int) -> Tensor:

@@ -73,7 +73,7 @@ class TransferFunction(Table):
         if not (halves.detach() > 0).all():
             raise ValueError(f"peak widths must be positive; got {(2 * halves).tolist()}")
         x = torch.cat((centers - halves, centers, centers + halves)).sort().values
-        x = x[torch.cat((x.new_ones(1, dtype=torch.bool), x.detach().diff() > 0))]
+        x = x[torch.cat((x.new_ones(1, dtype=torch.bool), x.detach().diff() > _FOOT * float((x[-1] - x[0]).detach())))]
         climb = 1 - (x[:, None] - centers).abs() / halves  # (M, peaks)
         shares = torch.where(climb > _FOOT, heights * climb, torch.zeros_like(climb))
         # at a foot every share is 0: the colour is that of the peaks that end there

@@ -7,7 +7,7 @@ image = render_scene(scene)
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -16,23 +16,19 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Domain
-from filterlab.io.config import dump_data, load_config, loads_config
-from filterlab.io.covers import load_slim
+from filterlab.io.config import load_config, loads_data
 from filterlab.recommendation import recommend, report
 from filterlab.render.dvr import Frame, prepare
 from filterlab.render.image import Progress
 from filterlab.render.legend import Legend
-from filterlab.render.materials import Material
-from filterlab.render.raycast import raycast
 from filterlab.render.sampling import Sampling
-from filterlab.render.shading import Light, Shading
+from filterlab.render.shading import Shading
 from filterlab.render.transfer import TransferFunction
-from filterlab.scenes.model import Lighting, Scene, SceneMethod, SurfaceModel
-from filterlab.scenes.shown import OfField, Shown
+from filterlab.scenes.model import LevelSetModel, Lighting, OnSurface, Scene, SceneMethod, SurfaceOfItsOwn
+from filterlab.scenes.shown import Casting, OfField
+from filterlab.scenes.terrain import VIEW, PreparedTerrain, Terrain
 from filterlab.scenes.values import PreparedProjection, PreparedSlice, camera_of, projection, sliced
-from filterlab.surfaces.base import Surface
 from filterlab.surfaces.level_set import LevelSet
-from filterlab.surfaces.slim import Slim
 from filterlab.volume import Volume
 
 
@@ -72,53 +68,10 @@ class Prepared(OfField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cast(Shown):
-    """A surface: what `raycast` takes."""
-
-    surface: Surface
-    material: Material
-    lights: tuple[Light, ...]
-
-    def render(self, progress: Progress = False) -> Tensor:
-        """The image `(H, W, 4)`, as `filterlab.render.raycast.raycast` gives it."""
-        asked = self.scene.surface
-        assert asked is not None
-        image = raycast(
-            self.surface,
-            self.camera,
-            self.material,
-            size=self.size,
-            lights=self.lights,
-            background=self.background,
-            region=self.region,
-            sheets=asked.sheets,
-            shadows=asked.shadows,
-            subpixels=asked.subpixels,
-            seed=self.scene.jitter or 0,
-            dtype=self.scene.dtype,
-            device=self.device,
-            progress=progress,
-        )
-        assert isinstance(image, Tensor)
-        return image
-
-
-@dataclass(frozen=True, kw_only=True)
-class PreparedSurface(Cast, OfField):
+class PreparedSurface(Casting, OfField):
     """The level set of a field."""
 
     surface: LevelSet
-
-
-@dataclass(frozen=True, kw_only=True)
-class PreparedSlim(Cast):
-    """A SLIM surface."""
-
-    surface: Slim
-
-    @property
-    def domain(self) -> Domain:
-        return self.surface.domain
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Scene:
@@ -142,17 +95,31 @@ def surface_scene(volume: str | os.PathLike[str], level: str, overrides: Mapping
         ConfigError: as `load_scene`.
     """
     content = {"volume": str(volume), "surface": {"level": _number(level), "subpixels": 2}, **_SURFACE}
-    return loads_config(dump_data(content), Scene, overrides, name="--level")
+    return loads_data(content, Scene, overrides, name="--level")
 
 
-def slim_scene(path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Scene:
-    """The scene of a SLIM surface in a file, seen whole, lit as that of a `surface_scene`.
+def alone_scene(path: str | os.PathLike[str], key: str, overrides: Mapping[str, str] | None = None) -> Scene:
+    """The scene of a surface in a file of its own, seen whole, lit as that of a `surface_scene`.
+
+    Args:
+        key: of the surface that the file stands for: slim, quadrics, ….
+        overrides: as for `load_scene`.
 
     Raises:
         ConfigError: as `load_scene`.
     """
-    content = {"surface": {"slim": str(path), "subpixels": 2}, **_SURFACE, "camera": {"direction": _DIRECTION}}
-    return loads_config(dump_data(content), Scene, overrides, name=str(path))
+    content = {"surface": {key: str(path), "subpixels": 2}, **_SURFACE, "camera": {"direction": _DIRECTION}}
+    return loads_data(content, Scene, overrides, name=str(path))
+
+
+def terrain_scene(heights: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Scene:
+    """The scene of a terrain in a file with everything else left out: all of it from the south, lit from north-west.
+
+    Raises:
+        ConfigError: as `load_scene`.
+    """
+    content = {"terrain": {"heights": str(heights)}, **_TERRAIN}
+    return loads_data(content, Scene, overrides, name=str(heights))
 
 
 def values_scene(volume: str | os.PathLike[str], overrides: Mapping[str, str]) -> Scene:
@@ -161,7 +128,7 @@ def values_scene(volume: str | os.PathLike[str], overrides: Mapping[str, str]) -
     Raises:
         ConfigError: as `load_scene`.
     """
-    return loads_config(dump_data({"volume": str(volume)}), Scene, overrides, name="the command line")
+    return loads_data({"volume": str(volume)}, Scene, overrides, name="the command line")
 
 
 _DIRECTION = [-0.6, 0.75, -0.5]
@@ -169,6 +136,11 @@ _SURFACE: Mapping[str, Any] = {
     "camera": {"direction": _DIRECTION, "window": [0.12, 0.12, 0.88, 0.88]},
     "lighting": {"lights": [{"direction": [0.5, -0.6, 0.8], "color": [0.9, 0.88, 0.85]}, {"color": [0.3, 0.32, 0.36]}]},
     "background": [0.02, 0.022, 0.03],
+}
+
+_TERRAIN: Mapping[str, Any] = {
+    "camera": VIEW.model_dump(mode="json", exclude_unset=True),
+    "size": [960, 600],
 }
 
 
@@ -180,7 +152,7 @@ def _number(text: str) -> float | str:
         return text
 
 
-AnyPrepared = Prepared | PreparedSurface | PreparedSlim | PreparedProjection | PreparedSlice
+AnyPrepared = Prepared | Casting | PreparedProjection | PreparedSlice
 
 
 def build(scene: Scene, volume: Volume | None = None) -> AnyPrepared:
@@ -191,8 +163,10 @@ def build(scene: Scene, volume: Volume | None = None) -> AnyPrepared:
 
     Raises ValueError where `method: auto` finds nothing within its budget, with the best there is.
     """
-    if scene.slim is not None:
-        return _cover(scene, scene.slim)
+    if scene.terrain is not None:
+        return PreparedTerrain.of(scene, Terrain.of(scene.terrain, scene.terrain.load(), scene.device))
+    if isinstance(scene.surface, SurfaceOfItsOwn):
+        return _alone(scene, scene.surface)
     volume = _volume(scene, volume)
     scene, chosen = settled(scene, volume)
     if volume is None:
@@ -207,8 +181,9 @@ def build(scene: Scene, volume: Volume | None = None) -> AnyPrepared:
         "volume_bytes": 0 if volume is None else volume.samples.nbytes,
         "chosen": chosen,
     }
-    if scene.surface is not None:
-        return _surface(scene.surface, shown, value_range)
+    if isinstance(scene.surface, LevelSetModel):
+        surface = LevelSet(field, scene.surface.at(value_range))
+        return PreparedSurface(**shown, surface=surface, **_lit(scene, scene.surface))
     if scene.mip is not None:
         return projection(scene.mip, shown, value_range)
     if scene.slice is not None:
@@ -234,24 +209,18 @@ def _shown(scene: Scene, domain: Domain) -> dict[str, Any]:
     }
 
 
-def _surface(
-    asked: SurfaceModel, shown: dict[str, Any], value_range: Callable[[], tuple[float, float]]
-) -> PreparedSurface:
-    surface = LevelSet(shown["field"], asked.at(value_range))
-    return PreparedSurface(**shown, surface=surface, **_lit(shown["scene"], asked))
+def _alone(scene: Scene, asked: SurfaceOfItsOwn) -> Casting:
+    surface = asked.build()
+    tensors = surface.tensors
+    if tensors is not None and scene.device != "cpu":
+        surface = surface.with_tensors([x.to(scene.device) for x in tensors])
+    return Casting(**_shown(scene, surface.domain), surface=surface, **_lit(scene, asked))
 
 
-def _cover(scene: Scene, path: str) -> PreparedSlim:
-    assert scene.surface is not None
-    slim = load_slim(path)
-    slim = slim.with_tensors([x.to(scene.device) for x in slim.tensors])
-    return PreparedSlim(**_shown(scene, slim.domain), surface=slim, **_lit(scene, scene.surface))
-
-
-def _lit(scene: Scene, asked: SurfaceModel) -> dict[str, Any]:
-    """What a surface is made of, and its lights."""
+def _lit(scene: Scene, asked: OnSurface) -> dict[str, Any]:
+    """What a surface is made of, its lights, and rays for a pixel."""
     lights = (scene.lighting or Lighting()).build().lights
-    return {"material": asked.material.build(), "lights": tuple(lights)}
+    return {"material": asked.material.build(), "lights": tuple(lights), "subpixels": asked.subpixels}
 
 
 def render_scene(scene: Scene, progress: Progress = False) -> Tensor:

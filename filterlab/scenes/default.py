@@ -11,7 +11,7 @@ from typing import Any
 
 from filterlab import missing_values
 from filterlab.fields.base import Field
-from filterlab.io.config import dump_data, loads_config
+from filterlab.io.config import loads_data
 from filterlab.render.camera import PerspectiveCamera
 from filterlab.render.suggestion import direction_for, sampled
 from filterlab.render.transfer import TransferFunction
@@ -45,7 +45,7 @@ def default_view(volume: str | os.PathLike[str], overrides: Mapping[str, str] | 
     overrides = dict(overrides or {})
     first = {key: text for key, text in overrides.items() if key.split(".")[0] in _FIRST}
     bare = {"volume": str(volume), "size": list(_SIZE), "surface": 0}
-    asked = loads_config(dump_data(bare), Scene, first, name=str(volume))
+    asked = loads_data(bare, Scene, first, name=str(volume))
     assert asked.volume is not None
     samples = asked.volume.load()
     method = asked.method or SceneMethod()
@@ -56,7 +56,7 @@ def default_view(volume: str | os.PathLike[str], overrides: Mapping[str, str] | 
         content["method"]["nan"] = "propagate"
     # classes and framing do not hang on the method: trilinear is soonest done
     field = SceneMethod(name="trilinear", boundary=method.boundary).build(samples, nan="propagate")
-    scene = loads_config(dump_data(content | suggested(field, asked.size)), Scene, overrides, name=str(volume))
+    scene = loads_data(content | suggested(field, asked.size), Scene, overrides, name=str(volume))
     return scene, samples
 
 

@@ -7,8 +7,9 @@ them (natural at its ends, periodic where the way is closed). Pictures are at eq
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -16,10 +17,12 @@ from pydantic import Field, model_validator
 
 from filterlab.io.config import StrictModel, load_config
 from filterlab.render.camera import Camera, PerspectiveCamera
+from filterlab.scenes.build import AnyPrepared
+from filterlab.scenes.model import Scene
+from filterlab.scenes.terrain import PreparedTerrain, Terrain
 
-if TYPE_CHECKING:
-    from filterlab.scenes.terrain import Terrain
-
+SECONDS = 0.04
+"""For which each picture of a flight is shown."""
 Above = Annotated[float, Field(gt=0)]
 Points = Annotated[list[tuple[float, float, Above]], Field(min_length=2, max_length=10_000)]
 _AHEAD = 0.02  # of the way, that the camera looks to
@@ -47,6 +50,12 @@ class Flight(StrictModel):
             raise ValueError("points: expected neighbours at different places; got the same twice in a row")
         return self
 
+    def views(self, prepared: AnyPrepared, count: int) -> list[AnyPrepared]:
+        """A scene of a terrain from equal steps along the way. Raises ValueError as `check_flight`, `cameras`."""
+        check_flight(prepared.scene)
+        assert isinstance(prepared, PreparedTerrain)
+        return [replace(prepared, camera=camera) for camera in self.cameras(prepared.terrain, count)]
+
     def cameras(self, terrain: Terrain, count: int) -> list[Camera]:
         """Cameras at equal steps along the way, never lower than a quarter of what is asked above the ground.
 
@@ -65,7 +74,7 @@ class _Way:
 
         self.flight, self.terrain = flight, terrain
         given = np.array(flight.points)
-        across = given[:, :2] * terrain.scale - np.array(terrain.shift)
+        across = given[:, :2] * terrain.scale[:2] - np.array(terrain.shift[:2])
         ground = self._ground(across)
         if np.isnan(ground).any():
             where = flight.points[int(np.isnan(ground).argmax())]
@@ -82,7 +91,8 @@ class _Way:
     def _ground(self, across: np.ndarray) -> np.ndarray:
         left, bottom, right, top = self.terrain.heights.extent
         inside = (across >= (left, bottom)).all(-1) & (across <= (right, top)).all(-1)
-        z = self.terrain.surface.jet(torch.from_numpy(np.ascontiguousarray(across)), 0)[0].numpy()
+        points = torch.from_numpy(np.ascontiguousarray(across)).to(self.terrain.device)
+        z = self.terrain.surface.jet(points, 0)[0].cpu().numpy()
         return np.where(inside, z, np.nan)
 
     def camera(self, part: float) -> Camera:
@@ -108,6 +118,12 @@ class _Way:
         )
         x, y = ahead - self.spline(u)[:2]
         return float(x), float(y)
+
+
+def check_flight(scene: Scene) -> None:
+    """Raises ValueError unless the scene has a ground to fly over."""
+    if scene.terrain is None:
+        raise ValueError("expected a terrain to fly over; the scene shows something else")
 
 
 def load_flight(path: Path) -> Flight:

@@ -25,206 +25,217 @@ from filterlab.ops.reference.march import segments
 from filterlab.render.dvr import Frame
 from filterlab.render.fused import FusedMarcher, empty_bricks, why_not_fused
 from filterlab.render.plain import Medium
-from filterlab.scenes.build import AnyPrepared, Cast, Prepared, PreparedSlim, PreparedSurface
+from filterlab.scenes.build import AnyPrepared, Prepared, PreparedSurface
 from filterlab.scenes.model import Scene
-from filterlab.scenes.shown import Shown
+from filterlab.scenes.shown import Casting, Shown
+from filterlab.scenes.shown import OfField as ShownField
+from filterlab.scenes.terrain import COMPASS, PreparedTerrain
 from filterlab.scenes.values import PreparedProjection, PreparedValues, samples_of
+from filterlab.surfaces import Quadrics, Slim
 from filterlab.surfaces.meshes import BYTES_OF_TRIANGLE, NODE_BYTES, Grid, mesh
 
 _PROBE_RAYS = 4096
 _PROBE_SEGMENTS = 1 << 21
 _PROBE_NODES = 1 << 17
 _REPEATS = 5
-_BALL_BYTES, _PLANE_BYTES = 188, 32  # of an index and what is in it (`surfaces.Slim`)
+_PIECE_BYTES, _PLANE_BYTES = 188, 32  # of an index and what is in it (`surfaces.Slim`, `surfaces.Quadrics`)
 _DERIVATIVES = ("values", "values and gradients", "values, gradients and Hessians")
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What rendering a scene takes.
+@dataclass(frozen=True, kw_only=True)
+class AnyPlan:
+    """What a picture, or whatever else is made of a scene, takes.
 
     Attributes:
-        method, scheme, storage: of the field; the method of a signal that is not sampled is `exact`.
-        taps: coefficients that one value needs; None where there are none.
-        order: the highest derivative that is asked of the field: 1 with lighting, else 0.
-        marcher: fused or plain.
-        not_fused: why the marcher is plain.
-        rays, samples: of the whole image; samples before any is skipped or left out behind what is opaque.
-        empty_bricks: which part of the bricks has no opacity; None: no brick is known, as none is looked for.
-        skipped: which part of the samples lies in them.
-        step: in voxels.
-        volume_bytes, coefficient_bytes, image_bytes, ray_bytes: memory; rays are those that are in work or kept.
-        seconds: of the march, from the median and the quartiles of a few runs of some rays.
-        absent: what the scene leaves out and is therefore not computed.
+        seconds: from the median and the quartiles of a few runs of a part of it.
         chosen: how `method: auto` came to its choice, or nothing.
+    """
+
+    seconds: Quartiles
+    chosen: tuple[str, ...] = ()
+
+    def data(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfImage(AnyPlan):
+    """Of a picture.
+
+    Attributes:
+        rays: of the whole image, without those to lights.
+        image_bytes: memory.
+        absent: what the scene leaves out and is therefore not computed.
+    """
+
+    rays: int
+    image_bytes: int
+    absent: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfField(AnyPlan):
+    """Of a field.
+
+    Attributes:
+        method, scheme, storage: the method of a signal that is not sampled is `exact`.
+        taps: coefficients that one value needs; None where there are none.
+        volume_bytes, coefficient_bytes: memory.
     """
 
     method: str
     scheme: str
     storage: str
     taps: int | None
+    volume_bytes: int
+    coefficient_bytes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan(OfImage, OfField):
+    """What rendering a medium takes.
+
+    Attributes:
+        order: the highest derivative that is asked of the field: 1 with lighting, else 0.
+        marcher: fused or plain.
+        not_fused: why the marcher is plain.
+        samples: of the whole image, before any is skipped or left out behind what is opaque.
+        empty_bricks: which part of the bricks has no opacity; None: no brick is known, as none is looked for.
+        skipped: which part of the samples lies in them.
+        step: in voxels.
+        ray_bytes: memory of rays that are in work or kept.
+    """
+
     order: int
     marcher: str
     not_fused: str | None
-    rays: int
     samples: int
     empty_bricks: float | None
     skipped: float | None
     step: float
-    volume_bytes: int
-    coefficient_bytes: int
-    image_bytes: int
     ray_bytes: int
-    seconds: Quartiles
-    absent: tuple[str, ...]
-    chosen: tuple[str, ...] = ()
 
     @property
     def derivatives(self) -> str:
         """The order in words."""
         return _DERIVATIVES[self.order]
 
-    def data(self) -> dict[str, Any]:
-        """Plain data."""
-        return asdict(self)
 
-
-@dataclass(frozen=True)
-class SurfacePlan:
-    """What casting rays at the surface of a scene takes.
+@dataclass(frozen=True, kw_only=True)
+class OfSurface(OfImage):
+    """Of a surface that rays are cast at.
 
     Attributes:
-        method, scheme, storage, taps: as in `Plan`.
+        order: derivatives of the surface that its material needs: 1 normals, 2 curvatures.
+    """
+
+    order: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfacePlan(OfSurface, OfField):
+    """What casting rays at a level set takes.
+
+    Attributes:
         level: the value on the surface.
         degree: of the field's pieces along a ray.
         cells, pieces: how many of the volume may hold the level; no others are looked into.
-        order: derivatives of the surface that its material needs: 1 normals, 2 curvatures.
-        rays: of the whole image, without those to lights.
-        volume_bytes, coefficient_bytes, image_bytes: memory.
-        seconds: from the median and the quartiles of a few runs of some rays.
-        absent, chosen: as in `Plan`.
     """
 
-    method: str
-    scheme: str
-    storage: str
-    taps: int | None
     level: float
     degree: int
     cells: int
     pieces: int
-    order: int
-    rays: int
-    volume_bytes: int
-    coefficient_bytes: int
-    image_bytes: int
-    seconds: Quartiles
-    absent: tuple[str, ...]
-    chosen: tuple[str, ...] = ()
-
-    def data(self) -> dict[str, Any]:
-        """Plain data."""
-        return asdict(self)
 
 
-@dataclass(frozen=True)
-class ValuePlan:
+@dataclass(frozen=True, kw_only=True)
+class PiecesPlan(OfSurface):
+    """What casting rays at quadrics takes, blended or not.
+
+    Attributes:
+        pieces: how many there are, and `called`: what they are.
+        planes: that some of them are cut by, for each.
+        surface_bytes: memory of their numbers and their index.
+    """
+
+    pieces: int
+    called: str
+    planes: int
+    surface_bytes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerrainPlan(OfSurface):
+    """What casting rays at a terrain takes.
+
+    Attributes:
+        size: heights along x and y. missing: how many of them there are none.
+        filled: whether those are made from others.
+        spacing, extent: in metres.
+        span: the lowest and the highest height, but for ½ % at either end, in `unit` ("" where none is declared).
+        spline, cells: of the surface; two quartics in each cell.
+        exaggeration: how many times as high as it is, and `suggested`: whether by its relief.
+        looks, sun: azimuth and degrees down, or up; `looks` is None for a camera at a place.
+        shadows: whether they are cast.
+        height_bytes, bound_bytes: memory of heights, and of bounds of blocks of them.
+    """
+
+    size: tuple[int, int]
+    missing: int
+    filled: bool
+    spacing: tuple[float, float]
+    extent: tuple[float, float]
+    span: tuple[float, float]
+    unit: str
+    spline: str
+    cells: tuple[int, int]
+    exaggeration: float
+    suggested: bool
+    looks: tuple[float, float] | None
+    sun: tuple[float, float] | None
+    shadows: bool
+    height_bytes: int
+    bound_bytes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValuePlan(OfImage, OfField):
     """What a picture of values takes: a maximum intensity projection, or a slice.
 
     Attributes:
-        method, scheme, storage, taps: as in `Plan`.
         kind: which of both.
-        rays, samples: of the whole image; of a slice one sample a ray at most.
+        samples: of the whole image; of a slice one a ray at most.
         step: of a projection, in voxels.
-        volume_bytes, coefficient_bytes, image_bytes, work_bytes: memory; work is what is looked at together, at most.
-        seconds: of all rays, from the median and the quartiles of a few runs of some.
-        absent, chosen: as in `Plan`.
+        work_bytes: memory of what is looked at together, at most.
     """
 
-    method: str
-    scheme: str
-    storage: str
-    taps: int | None
     kind: str
-    rays: int
     samples: int
     step: float | None
-    volume_bytes: int
-    coefficient_bytes: int
-    image_bytes: int
     work_bytes: int
-    seconds: Quartiles
-    absent: tuple[str, ...]
-    chosen: tuple[str, ...] = ()
-
-    def data(self) -> dict[str, Any]:
-        """Plain data."""
-        return asdict(self)
 
 
-@dataclass(frozen=True)
-class MeshPlan:
-    """What making triangles of the surface of a scene takes.
+@dataclass(frozen=True, kw_only=True)
+class MeshPlan(OfField):
+    """What making triangles of the surface of a scene takes: at most `seconds`, for all of it grows as the grid does.
 
     Attributes:
-        method, scheme, storage, taps, level: as in `SurfacePlan`.
+        level: as in `SurfacePlan`.
         step: of the grid, in voxels.
         size: points of the grid along x, y, z.
         triangles: about; from those on a coarser grid.
         residual: the largest |f − level| at a vertex there.
-        volume_bytes, coefficient_bytes, grid_bytes, mesh_bytes: memory; of the grid what is looked at together.
-        seconds: from a few runs on a coarser grid, as if all of it grew as the grid does: at most that.
-        chosen: as in `Plan`.
+        grid_bytes, mesh_bytes: memory; of the grid what is looked at together.
     """
 
-    method: str
-    scheme: str
-    storage: str
-    taps: int | None
     level: float
     step: float
     size: tuple[int, int, int]
     triangles: int
     residual: float
-    volume_bytes: int
-    coefficient_bytes: int
     grid_bytes: int
     mesh_bytes: int
-    seconds: Quartiles
-    chosen: tuple[str, ...] = ()
-
-    def data(self) -> dict[str, Any]:
-        """Plain data."""
-        return asdict(self)
-
-
-@dataclass(frozen=True)
-class SlimPlan:
-    """What casting rays at a SLIM surface takes.
-
-    Attributes:
-        balls: of the cover. cuts: planes that some of them are cut by, for each.
-        order, rays, image_bytes, seconds, absent: as in `SurfacePlan`.
-        cover_bytes: memory of its numbers and their index.
-        chosen: nothing.
-    """
-
-    balls: int
-    cuts: int
-    order: int
-    rays: int
-    cover_bytes: int
-    image_bytes: int
-    seconds: Quartiles
-    absent: tuple[str, ...]
-    chosen: tuple[str, ...] = ()
-
-    def data(self) -> dict[str, Any]:
-        """Plain data."""
-        return asdict(self)
-
-
-AnyPlan = Plan | SurfacePlan | SlimPlan | ValuePlan
 
 
 def plan_of_mesh(prepared: PreparedSurface, step: float) -> MeshPlan:
@@ -238,49 +249,45 @@ def plan_of_mesh(prepared: PreparedSurface, step: float) -> MeshPlan:
     triangles = round(len(made.faces) * coarser**2)
     nx, ny, nz = grid.size
     return MeshPlan(
-        **_described(prepared.field),
+        **_of_field(prepared),
         level=float(surface.level),
         step=step,
         size=grid.size,
         triangles=triangles,
         residual=made.residual,
-        volume_bytes=prepared.volume_bytes,
-        coefficient_bytes=coefficient_bytes(prepared.field),
         grid_bytes=NODE_BYTES * nx * ny * (min(grid.layers_at_once, nz - 1) + 1),
         mesh_bytes=triangles * BYTES_OF_TRIANGLE,
         seconds=_timed(lambda: mesh(surface, step * coarser).vertices, share),
-        chosen=prepared.chosen,
     )
 
 
-def plan(prepared: AnyPrepared) -> AnyPlan:
+def plan(prepared: AnyPrepared) -> OfImage:
     """The plan of a scene that is built; some of its rays are followed, the picture is not made.
 
     Takes as long as a few thousand rays do, five times over.
     """
+    if isinstance(prepared, Prepared):
+        return _plan_of_medium(prepared)
     if isinstance(prepared, PreparedValues):
         return _plan_of_values(prepared)
-    if isinstance(prepared, PreparedSlim):
-        return _plan_of_slim(prepared)
-    return _plan_of_surface(prepared) if isinstance(prepared, PreparedSurface) else _plan_of_medium(prepared)
+    if isinstance(prepared, PreparedTerrain):
+        return _plan_of_terrain(prepared)
+    return _plan_of_surface(prepared) if isinstance(prepared, PreparedSurface) else _plan_of_pieces(prepared)
 
 
 def _plan_of_values(prepared: PreparedValues) -> ValuePlan:
     (width, height), scene = prepared.size, prepared.scene
     projected = isinstance(prepared, PreparedProjection)
     return ValuePlan(
-        **_described(prepared.field),
+        **_of_field(prepared),
         kind="maximum along every ray" if projected else "slice",
         rays=width * height,
         samples=samples_of(prepared) if isinstance(prepared, PreparedProjection) else width * height,
         step=scene.step_or_default if projected else None,
-        volume_bytes=prepared.volume_bytes,
-        coefficient_bytes=coefficient_bytes(prepared.field),
         image_bytes=width * height * 5 * scene.dtype.itemsize,
         work_bytes=prepared.work_bytes,
         seconds=_seconds_of_a_smaller(prepared, width * height),
         absent=_absent_of_values(scene),
-        chosen=prepared.chosen,
     )
 
 
@@ -289,50 +296,76 @@ def _absent_of_values(scene: Scene) -> tuple[str, ...]:
 
 
 def _plan_of_surface(prepared: PreparedSurface) -> SurfacePlan:
-    field, scene = prepared.field, prepared.scene
-    assert scene.surface is not None
-    relevant, (width, height) = prepared.surface.relevant(), prepared.size
-    rays = width * height * scene.surface.subpixels**2
+    relevant = prepared.surface.relevant()
     return SurfacePlan(
-        **_described(field),
+        **_of_field(prepared),
+        **_of_rays(prepared),
         level=float(prepared.surface.level),
-        degree=field.degree_along_rays or 0,
+        degree=prepared.field.degree_along_rays or 0,
         cells=relevant.cells,
         pieces=relevant.pieces,
-        order=prepared.material.order,
-        rays=rays,
-        volume_bytes=prepared.volume_bytes,
-        coefficient_bytes=coefficient_bytes(field),
-        image_bytes=width * height * 4 * scene.dtype.itemsize,
-        seconds=_seconds_of_surface(prepared, rays),
-        absent=_absent_of_surface(scene),
-        chosen=prepared.chosen,
     )
 
 
-def _plan_of_slim(prepared: PreparedSlim) -> SlimPlan:
-    scene, slim, (width, height) = prepared.scene, prepared.surface, prepared.size
-    assert scene.surface is not None
-    rays, cuts = width * height * scene.surface.subpixels**2, 0 if slim.cuts is None else slim.cuts.shape[1]
-    numbers = sum(x.nbytes for x in slim.tensors) + (0 if slim.cuts is None else slim.cuts.nbytes)
-    return SlimPlan(
-        balls=len(slim),
-        cuts=cuts,
-        order=prepared.material.order,
-        rays=rays,
-        cover_bytes=numbers + len(slim) * (_BALL_BYTES + _PLANE_BYTES * cuts),
-        image_bytes=width * height * 4 * scene.dtype.itemsize,
-        seconds=_seconds_of_surface(prepared, rays),
-        absent=_absent_of_surface(scene),
+def _plan_of_pieces(prepared: Casting) -> PiecesPlan:
+    surface = prepared.surface
+    assert isinstance(surface, Slim | Quadrics)
+    if isinstance(surface, Slim):
+        called, planes = "SLIM, {} balls", surface.cuts
+    else:
+        called, planes = "{} quadrics", surface.bounds.planes
+    count = 0 if planes is None else planes.shape[1]
+    numbers = sum(x.nbytes for x in surface.tensors) + (0 if planes is None else planes.nbytes)
+    return PiecesPlan(
+        **_of_rays(prepared),
+        pieces=len(surface),
+        called=called.format(f"{len(surface):,}"),
+        planes=count,
+        surface_bytes=numbers + len(surface) * (_PIECE_BYTES + _PLANE_BYTES * count),
     )
 
 
-def _seconds_of_surface(prepared: Cast, rays: int) -> Quartiles:
-    """Of all rays, from one for each pixel of a smaller picture."""
-    scene = prepared.scene.model_copy(
-        update={"surface": prepared.scene.surface.model_copy(update={"subpixels": 1})}  # type: ignore[union-attr]
+def _plan_of_terrain(prepared: PreparedTerrain) -> TerrainPlan:
+    terrain, surface, view = prepared.terrain, prepared.surface, prepared.scene.camera
+    left, bottom, right, top = terrain.heights.extent
+    dx, dy = terrain.heights.spacing
+    return TerrainPlan(
+        **_of_rays(prepared),
+        size=terrain.heights.size,
+        missing=int(terrain.heights.missing.sum()),
+        filled=terrain.look.fill,
+        spacing=(abs(dx), abs(dy)),
+        extent=(right - left, top - bottom),
+        span=terrain.span,
+        unit=terrain.unit,
+        spline=surface.spline.name,
+        cells=surface.cells,
+        exaggeration=terrain.exaggeration,
+        suggested=terrain.look.exaggeration is None,
+        looks=COMPASS if view.framed else view.compass,
+        sun=terrain.look.sun if prepared.scene.lighting is None else None,
+        shadows=terrain.look.shadows,
+        height_bytes=surface.heights.nbytes,
+        bound_bytes=surface.cast.pyramid.numbers.nbytes,
     )
-    return _seconds_of_a_smaller(replace(prepared, scene=scene), rays)
+
+
+def _of_field(prepared: ShownField) -> dict[str, Any]:
+    """What every plan of a field has."""
+    sizes = {"volume_bytes": prepared.volume_bytes, "coefficient_bytes": coefficient_bytes(prepared.field)}
+    return _described(prepared.field) | sizes | {"chosen": prepared.chosen}
+
+
+def _of_rays(prepared: Casting) -> dict[str, Any]:
+    """What every plan of a surface has."""
+    (width, height), rays = prepared.size, prepared.size[0] * prepared.size[1] * prepared.subpixels**2
+    return {
+        "rays": rays,
+        "image_bytes": width * height * 4 * prepared.scene.dtype.itemsize,
+        "order": prepared.material.order,
+        "seconds": _seconds_of_a_smaller(replace(prepared, subpixels=1), rays),
+        "absent": _absent_of_surface(prepared.scene),
+    }
 
 
 def _seconds_of_a_smaller(prepared: Shown, rays: int) -> Quartiles:
@@ -371,9 +404,8 @@ def _plan_of_medium(prepared: Prepared) -> Plan:
     medium, some = frame.media[0], _some_rays(frame)
     seconds = _seconds(frame, medium, some)
     empty, skipped = _skipped(frame, medium, some)
-    field = prepared.field
     return Plan(
-        **_described(field),
+        **_of_field(prepared),
         order=medium.order,
         marcher="fused" if isinstance(frame.marcher, FusedMarcher) else "plain",
         not_fused=why_not_fused(medium),
@@ -382,13 +414,10 @@ def _plan_of_medium(prepared: Prepared) -> Plan:
         empty_bricks=empty,
         skipped=skipped,
         step=prepared.scene.step_or_default,
-        volume_bytes=prepared.volume_bytes,
-        coefficient_bytes=coefficient_bytes(field),
         image_bytes=frame.image_bytes,
         ray_bytes=frame.ray_bytes,
         seconds=seconds,
         absent=_absent(prepared.scene),
-        chosen=prepared.chosen,
     )
 
 
@@ -427,7 +456,7 @@ def _skipped(frame: Frame, medium: Medium, some: Chords) -> tuple[float | None, 
 
 def _absent_of_surface(scene: Scene) -> tuple[str, ...]:
     """What is not computed of a surface, because the scene does not ask for it."""
-    asked = scene.surface
+    asked = scene.cast
     assert asked is not None
     parts = []
     if asked.sheets == 1:
@@ -435,7 +464,7 @@ def _absent_of_surface(scene: Scene) -> tuple[str, ...]:
     if not asked.shadows:
         parts.append("shadows")
     if scene.region is None:
-        parts.append("region: rays are cut to the volume only")
+        parts.append(f"region: rays are cut to {'the volume' if scene.alone is None else 'what is shown'} only")
     if asked.subpixels == 1:
         parts.append("subpixels: one ray for each pixel")
     return tuple(parts)

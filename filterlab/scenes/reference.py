@@ -85,8 +85,14 @@ def _is_list(annotation: Any) -> bool:
 
 
 def _tag(model: type[Section]) -> str:
-    """The kind by which it is told from others."""
-    return typing.get_args(model.model_fields["kind"].annotation)[0]
+    """What it is told from others by: its kind, or the first key of its own."""
+    kind = model.model_fields.get("kind")
+    return keys_of(model)[0] if kind is None else typing.get_args(kind.annotation)[0]
+
+
+def keys_of(model: type[Section]) -> list[str]:
+    """All keys, those of its own before those that others have too."""
+    return sorted(model.model_fields, key=lambda name: name not in model.__annotations__)
 
 
 def _models(annotation: Any) -> list[type[Section]]:
@@ -104,7 +110,8 @@ def _section(heading: str, model: type[Section]) -> Iterator[str]:
     yield _text(inspect.getdoc(model) or "") + "\n"
     yield "| key | what it is | value | default |"
     yield "|---|---|---|---|"
-    for name, field in model.model_fields.items():
+    for name in keys_of(model):
+        field = model.model_fields[name]
         yield f"| `{name}` | {described(model)[name]} | {value_of(field)} | {default_of(field)} |"
     yield ""
     key = heading.split(":")[0].split(".")[-1]

@@ -1,142 +1,59 @@
-"""A terrain as a picture: heights in a file, and how they are looked at, lit and coloured; or a flight over them.
+"""A terrain as a picture: heights in a file, and how they are looked at, lit and coloured.
 
     Heights ─▶ metres, about the middle ─▶ HeightField ─┐
-    TerrainScene ─▶ exaggeration, colours, sun, camera ─┴─▶ raycast
+    TerrainLook ─▶ exaggeration, colours, sun, camera ──┴─▶ PreparedTerrain ─▶ raycast
 
-Everything has a default, so that a file alone is a view. The world of a scene has its origin in the middle of the map,
-in metres; `shift` leads there from the coordinates of the file.
+Everything has a default, so that a file alone is a view. The world of a picture has its origin in the middle of the
+map, in metres; `Terrain.place` leads there from the coordinates of the file.
 """
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
-from pydantic import Field, field_validator
-from pydantic_core import to_jsonable_python
 from torch import Tensor
 
-from filterlab.heights import DEGREE, Heights
-from filterlab.io.config import StrictModel, loads_config
+from filterlab.heights import DEGREE, METRE, Heights
 from filterlab.io.images import from_srgb, load_image
 from filterlab.render import materials, relief
-from filterlab.render.camera import Camera, PerspectiveCamera
-from filterlab.render.colormaps import HYPSOMETRIC, ColorScale, check_colormap
-from filterlab.render.image import Progress
+from filterlab.render.camera import Camera
+from filterlab.render.colormaps import ColorScale
 from filterlab.render.legend import Legend
 from filterlab.render.materials import Coloring, Material
-from filterlab.render.raycast import raycast
+from filterlab.render.rays import Region
 from filterlab.render.scenery import Block, Haze, Sky, Water, sun, toward
 from filterlab.render.shading import Light
-from filterlab.scenes.model.colors import parsed
-from filterlab.scenes.model.quantities import Positive
+from filterlab.scenes.model import CameraView, Scene, TerrainLook
+from filterlab.scenes.model.terrain import CLEAR, NO_SKY, QUANTITIES, MattModel, one_color
+from filterlab.scenes.shown import Casting
 from filterlab.surfaces import HeightField
 
-QUANTITIES = ("slope", "aspect", "normal", "hillshade")
-"""What may be asked for as colours, beside colormaps by height and one colour."""
-MATERIALS = ("matt", "reflection_lines", "mirror")
-
+COMPASS = (20.0, 33.0)
+"""Where the camera looks where nobody says: clockwise from north, and down, in degrees."""
+VIEW = CameraView(compass=COMPASS, field_of_view=25.0, margin=1.06)
+"""That of a terrain alone."""
 STEEP = 0.08
 """Height of what is seen, as part of how wide it is, that exaggeration is suggested for."""
 _NICE = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 20.0)
 _LEFT_OUT = 0.005  # of the heights at either end: tints and exaggeration are for the others
-_SUN, _SKYLIGHT = (1.15, 1.06, 0.93), (0.26, 0.31, 0.4)
+_SUN = (1.15, 1.06, 0.93)
+_PAPER = (1.0, 1.0, 1.0)  # behind a legend
+_SHORT = {METRE: "m", "kilometre": "km", "foot": "ft"}
 _TABLE = (0.5, 0.54, 0.6)  # what a block stands before
 _DEPTH = 0.03  # of the width, from the lowest height to the base of the block
 _FRAMED = 48  # points along each side that the camera has in view
 
-Ends = tuple[float, float]
-Degrees = Annotated[float, Field(ge=-360, le=360)]
+Place = tuple[float, float, float]
 
 
-class TerrainScene(StrictModel):
-    """How heights are shown.
-
-    Attributes:
-        spline: of the surface.
-        exaggeration: how many times as high as it is the ground stands; None: as its relief suggests.
-        view: azimuth that the camera looks to, and how many degrees it looks down.
-        field_of_view: of the camera, vertical.
-        sun: azimuth and altitude of the sun.
-        color: a colormap, by height; "slope", "aspect", "normal" or "hillshade"; or one colour.
-        range: heights, slopes or azimuths at both ends of the colours; None: those that there are.
-        drape: a picture instead: PNG or JPEG that covers the whole map, or a GeoTIFF with its own extent.
-        material: "matt"; "reflection_lines" or "mirror", which show how smooth a surface is.
-        sky: an equirectangular picture of what is around; None: a clear sky.
-        water: the level of still water, in the unit of the heights; None: there is none.
-        haze: distance in metres at which 1/e of a colour is left; None: there is none.
-        block: whether there are walls of earth where the ground ends.
-        fill: whether heights that are missing are made from those around; else they are holes.
-        unit: of x and y, where the file declares none.
-    """
-
-    spline: Literal["linear", "c0", "c1", "c2"] = "c1"
-    exaggeration: Annotated[float, Field(gt=0, le=1000)] | None = None
-    view: tuple[Degrees, Annotated[float, Field(ge=1, le=89)]] = (20.0, 33.0)
-    field_of_view: Annotated[float, Field(gt=0, lt=180)] = 25.0
-    sun: tuple[Degrees, Annotated[float, Field(gt=0, le=90)]] = (315.0, 38.0)
-    color: str = HYPSOMETRIC
-    range: Ends | None = None
-    drape: Path | None = None
-    material: Literal["matt", "reflection_lines", "mirror"] = "matt"
-    sky: Path | None = None
-    water: float | None = None
-    haze: Positive | None = None
-    block: bool = True
-    fill: bool = False
-    shadows: bool = True
-    size: tuple[Annotated[int, Field(ge=1, le=65536)], Annotated[int, Field(ge=1, le=65536)]] = (960, 600)
-    subpixels: Annotated[int, Field(ge=1, le=8)] = 2
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    unit: str | None = None
-
-    @field_validator("color")
-    @classmethod
-    def _known_color(cls, name: str) -> str:
-        if name not in QUANTITIES and _one_color(name) is None:
-            try:
-                check_colormap(name)
-            except ValueError as error:
-                raise ValueError(f"{error}; or {', '.join(QUANTITIES)}, or a colour by name") from None
-        return name
-
-    @field_validator("range")
-    @classmethod
-    def _increasing(cls, ends: Ends | None) -> Ends | None:
-        if ends is not None and not ends[0] < ends[1]:
-            raise ValueError(f"expected the lower end first; got {ends[0]:g} and {ends[1]:g}")
-        return ends
-
-
-def scene_of(given: Mapping[str, Any]) -> TerrainScene:
-    """The scene of options, by their names. Raises ConfigError that tells of `--name`."""
-    asked = {name: json.dumps(to_jsonable_python(value)) for name, value in given.items() if value is not None}
-    return loads_config("{}", TerrainScene, asked)
-
-
-def _one_color(name: str) -> tuple[float, float, float] | None:
-    """The colour of that name; None for a quantity, and for a colormap, which `gray` and `pink` are as well."""
-    if name in QUANTITIES:
-        return None
-    try:
-        check_colormap(name)
-    except ValueError:
-        try:
-            return parsed(name)[0]
-        except ValueError:
-            return None
-    return None
-
-
-def local(heights: Heights, unit: str | None = None) -> tuple[Heights, tuple[float, float], tuple[float, float]]:
-    """Heights in metres about their middle: (heights, scale, shift), local = scale · coordinate − shift.
+def local(heights: Heights, unit: str | None = None) -> tuple[Heights, Place, Place]:
+    """Heights in metres about their middle: (heights, scale, shift), local = scale · (x, y, height) − shift.
 
     Args:
         unit: of x and y, where none is declared; None there: degrees where the numbers look like them.
@@ -149,42 +66,52 @@ def local(heights: Heights, unit: str | None = None) -> tuple[Heights, tuple[flo
     guessed = DEGREE if heights.looks_like_degrees else None
     metres = replace(heights, unit=heights.unit or unit or guessed).in_metres()
     left, bottom, right, top = metres.extent
-    shift = ((left + right) / 2, (bottom + top) / 2)
-    scale = (metres.spacing[0] / heights.spacing[0], metres.spacing[1] / heights.spacing[1])
-    origin = tuple(o - s for o, s in zip(metres.origin, shift, strict=True))
+    shift = ((left + right) / 2, (bottom + top) / 2, 0.0)
+    along_x, along_y = (m / s for m, s in zip(metres.spacing, heights.spacing, strict=True))
+    scale = (along_x, along_y, heights.height_in_metres)
+    origin = tuple(o - s for o, s in zip(metres.origin, shift, strict=False))
     return replace(metres, origin=origin), scale, shift  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class Terrain:
-    """A scene of heights, made ready.
+    """A ground and what is around it, made ready.
 
     Attributes:
-        scene: what was asked.
+        look: what was asked.
         heights: local, see `local`.
         scale, shift: from coordinates of the file to local ones.
+        unit: of heights in the file; "" where none is declared.
         crs: of the file.
+        device: where it is cast.
     """
 
-    scene: TerrainScene
+    look: TerrainLook
     heights: Heights
-    scale: tuple[float, float]
-    shift: tuple[float, float]
+    scale: Place
+    shift: Place
+    unit: str = ""
     crs: str | None = None
+    device: str = "cpu"
 
     @classmethod
-    def of(cls, scene: TerrainScene, heights: Heights) -> Terrain:
-        """Raises ValueError: no height at all; units, colours and ranges that are none."""
+    def of(cls, look: TerrainLook, heights: Heights, device: str = "cpu") -> Terrain:
+        """Raises ValueError: no height at all; a unit that is none."""
         if heights.missing.all():
             raise ValueError("expected a height somewhere; got none")
-        own, scale, shift = local(heights, scene.unit)
-        return cls(scene, own, scale, shift, heights.crs)
+        own, scale, shift = local(heights, look.unit)
+        return cls(look, own, scale, shift, heights.height_unit or "", heights.crs, device)
+
+    def place(self, point: Sequence[float]) -> Place:
+        """A point of the file, x, y and height, where it is in the picture's world."""
+        x, y, z = (s * c - o for c, s, o in zip(point, self.scale, self.shift, strict=True))
+        return x, y, z * self.exaggeration
 
     @cached_property
     def span(self) -> tuple[float, float]:
-        """The lowest and the highest height, but for half a percent at either end."""
+        """The lowest and the highest height of the file, but for half a percent at either end."""
         known = self.heights.samples[~self.heights.missing]
-        low, high = np.quantile(known[:: max(1, known.size // 2**20)], (_LEFT_OUT, 1 - _LEFT_OUT))
+        low, high = np.quantile(known[:: max(1, known.size // 2**20)], (_LEFT_OUT, 1 - _LEFT_OUT)) / self.scale[2]
         return float(low), float(high)
 
     @cached_property
@@ -196,9 +123,9 @@ class Terrain:
     @cached_property
     def exaggeration(self) -> float:
         """That of the scene, or the one that makes the relief `STEEP`, from 1 to 20."""
-        if self.scene.exaggeration is not None:
-            return self.scene.exaggeration
-        low, high = self.span
+        if self.look.exaggeration is not None:
+            return self.look.exaggeration
+        low, high = (end * self.scale[2] for end in self.span)
         wanted = STEEP * self.width / (high - low) if high > low else 1.0
         return max((nice for nice in _NICE if nice <= wanted), default=1.0)
 
@@ -208,25 +135,16 @@ class Terrain:
         high = self.heights.samples
         samples = high if self.exaggeration == 1 else high * high.dtype.type(self.exaggeration)
         return HeightField(
-            torch.from_numpy(samples),
-            self.scene.spline,
+            torch.from_numpy(samples).to(self.device),
+            self.look.spline,
             self.heights.spacing,
             self.heights.origin,
-            nan="fill" if self.scene.fill else "propagate",
+            prefilter=self.look.prefilter,
+            nan="fill" if self.look.fill else "propagate",
         )
 
     @cached_property
-    def camera(self) -> Camera:
-        """The whole map in view, as near as can be."""
-        return self._looking(*self.scene.view)
-
-    def _looking(self, azimuth: float, down: float) -> PerspectiveCamera:
-        across, size = toward(azimuth, -down), self.scene.size
-        return PerspectiveCamera.of_points(
-            self._framed(), across, field_of_view=self.scene.field_of_view, aspect=size[0] / size[1], margin=1.06
-        )
-
-    def _framed(self) -> Tensor:
+    def framed(self) -> Tensor:
         """World points (M, 3) of the ground, and of the base of the block below its edges."""
         rows, columns = (
             np.unique(np.linspace(0, n - 1, _FRAMED).round().astype(int)) for n in self.heights.samples.shape
@@ -236,7 +154,7 @@ class Terrain:
         y = self.heights.origin[1] + self.heights.spacing[1] * rows
         points = np.stack([*np.broadcast_arrays(x, y[:, None]), z], -1).reshape(-1, 3)
         points = points[np.isfinite(points).all(-1)]
-        edges = np.concatenate([points, *([points * (1, 1, 0) + (0, 0, self.base)] if self.scene.block else [])])
+        edges = np.concatenate([points, *([points * (1, 1, 0) + (0, 0, self.base)] if self.look.block else [])])
         return torch.from_numpy(edges if len(edges) else np.zeros((1, 3)))
 
     @cached_property
@@ -247,74 +165,73 @@ class Terrain:
     @cached_property
     def lights(self) -> tuple[Light, ...]:
         """The sun."""
-        return (sun(*self.scene.sun, color=_SUN),)
+        return (sun(*self.look.sun, color=_SUN),)
 
     @cached_property
     def material(self) -> Material:
         """What the ground is made of."""
-        if self.scene.material == "reflection_lines":
-            return materials.ReflectionLines((1.0, 0.0, 0.0), 12.0)
-        if self.scene.material == "mirror":
-            return materials.Environment(self._around, self.coloring, 0.5)
-        plain = self.scene.drape is None and self.scene.color in QUANTITIES
-        return relief.Unlit(self.coloring) if plain else relief.Lambertian(self.coloring, _SKYLIGHT)
+        asked = self.look.material
+        if isinstance(asked, MattModel) and self.look.drape is None and self.look.color in QUANTITIES:
+            return relief.Unlit(self.coloring, asked.opacity)
+        made = asked.build(self.coloring)
+        if isinstance(made, materials.Environment) and made.picture is None:
+            return replace(made, picture=self._around)
+        return made
 
     @cached_property
     def _around(self) -> Tensor | None:
-        return None if self.scene.sky is None else load_image(self.scene.sky)
+        return None if self.look.sky in (CLEAR, NO_SKY) else load_image(self.look.sky)
 
     @cached_property
-    def sky(self) -> Callable[[Tensor], Tensor]:
-        """What is behind the ground."""
+    def sky(self) -> Callable[[Tensor], Tensor] | None:
+        """What is behind the ground; None: a background."""
+        if self.look.sky == NO_SKY:
+            return None
         if self._around is not None:
             return materials.Environment(self._around).around
-        return Sky(toward(*self.scene.sun), ground=_TABLE if self.haze is None else self.haze.color)
+        return Sky(toward(*self.look.sun), ground=_TABLE if self.haze is None else self.haze.color)
 
     @property
     def haze(self) -> Haze | None:
         """The air, which hides what is beyond the map as well."""
-        return None if self.scene.haze is None else Haze(self.scene.haze)
+        return None if self.look.haze is None else Haze(self.look.haze)
 
     @cached_property
     def coloring(self) -> Coloring:
         """The colours of the ground."""
-        if self.scene.drape is not None:
-            return self._draped(self.scene.drape)
-        name, e = self.scene.color, self.exaggeration
+        if self.look.drape is not None:
+            return self._draped(Path(self.look.drape))
+        name, e = self.look.color, self.exaggeration
         if name == "hillshade":
-            return relief.Hillshade(*self.scene.sun, e)
+            return relief.Hillshade(*self.look.sun, e)
         if name == "normal":
             return relief.ByNormal(e)
-        if name in QUANTITIES:
-            assert self.scale_shown is not None
-            return (relief.BySlope if name == "slope" else relief.ByAspect)(self.scale_shown, e)
-        single = _one_color(name)
+        single = one_color(name)
         if single is not None:
             return materials.Uniform(single)
-        assert self.scale_shown is not None
-        return relief.ByHeight(self.scale_shown, e)
+        if name == "slope":
+            return relief.BySlope(self.scale_shown, e)
+        if name == "aspect":
+            return relief.ByAspect(self.scale_shown, e)
+        return relief.ByHeight(self.scale_shown, e * self.scale[2])
 
     @cached_property
-    def scale_shown(self) -> ColorScale | None:
-        """The colours of values; None where there are no values to be told."""
-        name = self.scene.color
-        if self.scene.drape is not None or name in ("hillshade", "normal") or _one_color(name) is not None:
-            return None
+    def scale_shown(self) -> ColorScale:
+        """The colours of values."""
+        name, ends = str(self.look.color), self.look.range
         if name == "slope":
-            return ColorScale(*(self.scene.range or (0.0, 60.0)), "magma")
+            return ColorScale(*(ends or (0.0, 60.0)), "magma")
         if name == "aspect":
-            return ColorScale(*(self.scene.range or (0.0, 360.0)), "hsv")
-        return ColorScale(*(self.scene.range or self.span), name)
+            return ColorScale(*(ends or (0.0, 360.0)), "hsv")
+        return ColorScale(*(ends or self.span), name)
 
-    @property
-    def legend(self) -> Legend | None:
-        """That of the colours."""
-        if self.scale_shown is None:
+    def legend(self, label: str = "") -> Legend | None:
+        """That of the colours, if they stand for values."""
+        if not self.look.shows_values:
             return None
         labels = {"slope": "slope in degrees", "aspect": "faces to, degrees from north"}
-        unit = "m" if self.heights.height_unit else ""
-        label = labels.get(self.scene.color, f"height in {unit}" if unit else "height")
-        return Legend.of_scale(self.scale_shown, label=label)
+        height = f"height in {_SHORT.get(self.unit, self.unit)}" if self.unit else "height"
+        return Legend.of_scale(self.scale_shown, label=label or labels.get(str(self.look.color), height))
 
     def _draped(self, path: Path) -> Coloring:
         """A picture of the whole map, or one with its own place."""
@@ -341,39 +258,66 @@ class Terrain:
     @property
     def water(self) -> Water | None:
         """At its level, exaggerated as the ground is."""
-        if self.scene.water is None:
+        if self.look.water is None:
             return None
-        return Water(self.scene.water * self.exaggeration, clarity=max(0.004 * self.width, 1e-6))
+        level = self.look.water * self.scale[2] * self.exaggeration
+        return Water(level, clarity=max(0.004 * self.width, 1e-6))
 
     def options(self) -> dict[str, Any]:
-        """What `raycast` takes beside the surface."""
-        scene = self.scene
-        return {
-            "material": self.material,
-            "size": scene.size,
-            "lights": self.lights,
-            "background": self.sky,
-            "haze": self.haze,
-            "water": self.water,
-            "block": Block(self.base) if scene.block else None,
-            "shadows": scene.shadows and scene.material == "matt",
-            "subpixels": scene.subpixels,
-            "seed": scene.seed,
-        }
-
-    def render(self, progress: Progress = False, camera: Camera | None = None) -> Tensor:
-        """The picture (H, W, 3), linear RGB, by another camera where one is given."""
-        image = raycast(self.surface, camera or self.camera, progress=progress, **self.options())
-        assert isinstance(image, Tensor)
-        return image[..., :3].clamp(0, 1)
-
-    def around(self, count: int) -> list[Camera]:
-        """So many cameras of a whole turn, all as far away as the farthest that has everything in view."""
-        azimuth, down = self.scene.view
-        cameras = [self._looking(azimuth - 360 * k / count, down) for k in range(count)]
-        farthest = max(cameras, key=_distance)
-        return [farthest.turned(360 * (k - cameras.index(farthest)) / count) for k in range(count)]
+        """What `raycast` takes to show what is around."""
+        around = {"haze": self.haze, "water": self.water, "block": Block(self.base) if self.look.block else None}
+        return around if self.sky is None else around | {"background": self.sky}
 
 
-def _distance(camera: Camera) -> float:
-    return math.dist([float(v) for v in camera.position], [float(v) for v in camera.target])
+@dataclass(frozen=True, kw_only=True)
+class PreparedTerrain(Casting):
+    """A scene of a terrain. Its world has its origin in the middle of the map, in metres."""
+
+    terrain: Terrain
+    surface: HeightField
+
+    @classmethod
+    def of(cls, scene: Scene, terrain: Terrain) -> PreparedTerrain:
+        """Raises ValueError for pictures that can't be read, or that lie in another reference system."""
+        look = scene.cast
+        assert look is not None
+        return cls(
+            scene=scene,
+            camera=_framed(scene.camera, scene.size, terrain),
+            size=scene.size,
+            background=scene.background if terrain.sky is None else _PAPER,
+            region=_region(scene, terrain),
+            device=scene.device,
+            surface=terrain.surface,
+            material=terrain.material,
+            lights=terrain.lights if scene.lighting is None else tuple(scene.lighting.build().lights),
+            subpixels=look.subpixels,
+            terrain=terrain,
+        )
+
+    @property
+    def legend(self) -> Legend | None:
+        return self.terrain.legend(self.scene.legend_label)
+
+    @property
+    def told(self) -> str:
+        return f"{self.terrain.exaggeration:g} times as high as it is"
+
+    def framed(self, view: CameraView) -> Camera:
+        return _framed(view, self.size, self.terrain)
+
+    def options(self) -> dict[str, Any]:
+        return super().options() | self.terrain.options()
+
+
+def _framed(view: CameraView, size: tuple[int, int], terrain: Terrain) -> Camera:
+    """The camera of a view: at its place in the file, or with the whole map in view, as near as can be."""
+    if view.position is not None and view.target is not None:
+        moved = {"position": terrain.place(view.position), "target": terrain.place(view.target)}
+        return view.model_copy(update=moved).build(terrain.surface.domain, size)
+    seen = view.model_copy(update={"compass": COMPASS}) if view.framed else view
+    return seen.build(terrain.surface.domain, size, terrain.framed)
+
+
+def _region(scene: Scene, terrain: Terrain) -> Region | None:
+    return None if scene.region is None else tuple(map(terrain.place, scene.region.build()))  # type: ignore[return-value]

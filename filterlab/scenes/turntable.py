@@ -19,8 +19,8 @@ _SHORTEST = 0.02
 def turntable(prepared: AnyPrepared, count: int) -> list[AnyPrepared]:
     """The views of a whole turn about the axis along `up` through the target, at equal angles, the first ahead.
 
-    The field is that of `prepared`, built once. A camera that frames the domain keeps the distance from which all of it
-    is in view all the way round: it neither comes nearer nor cuts anything off.
+    The field is that of `prepared`, built once. A camera that frames what is shown keeps the distance from which all of
+    it is in view all the way round: it neither comes nearer nor cuts anything off.
 
     Raises:
         ValueError: fewer than two views; a slice, of which nothing is seen from its side.
@@ -28,7 +28,9 @@ def turntable(prepared: AnyPrepared, count: int) -> list[AnyPrepared]:
     check_turn(prepared.scene, count)
     turned = [prepared.camera.turned(360 * k / count) for k in range(count)]
     if prepared.scene.camera.position is None:
-        turned = _at_one_distance([_framed(prepared, camera) for camera in turned])
+        framed = [_framed(prepared, camera) for camera in turned]
+        first = max(range(count), key=lambda k: _reach(framed[k]))
+        turned = [framed[first].turned(360 * (k - first) / count) for k in range(count)]
     return [replace(prepared, camera=camera) for camera in turned]
 
 
@@ -41,22 +43,18 @@ def check_turn(scene: Scene, count: int) -> None:
 
 
 def _framed(prepared: AnyPrepared, camera: Camera) -> Camera:
-    """The camera that looks in the same direction, as near as all of the domain can be seen from there."""
+    """The camera that looks in the same direction, as near as all that is shown can be seen from there."""
     position, target = (torch.as_tensor(v, dtype=torch.float64) for v in (camera.position, camera.target))
-    view = prepared.scene.camera.model_copy(update={"direction": tuple((target - position).tolist())})
-    return view.build(prepared.domain, prepared.size)
+    looking = {"direction": tuple((target - position).tolist()), "compass": None}
+    return prepared.framed(prepared.scene.camera.model_copy(update=looking))
 
 
-def _at_one_distance(cameras: list[Camera]) -> list[Camera]:
-    """All of them as far away as the farthest (or, orthographic, as wide as the widest)."""
-    heights = [float(c.height) for c in cameras if isinstance(c, OrthographicCamera)]
-    if heights:
-        return [replace(c, height=max(heights)) for c in cameras]  # type: ignore[call-arg]
-    targets = [torch.as_tensor(c.target, dtype=torch.float64) for c in cameras]
-    sights = [torch.as_tensor(c.position, dtype=torch.float64) - t for c, t in zip(cameras, targets, strict=True)]
-    farthest = max(float(sight.norm()) for sight in sights)
-    places = [t + s * (farthest / float(s.norm())) for t, s in zip(targets, sights, strict=True)]
-    return [replace(c, position=place) for c, place in zip(cameras, places, strict=True)]
+def _reach(camera: Camera) -> float:
+    """How far away it is; how much an orthographic one sees."""
+    if isinstance(camera, OrthographicCamera):
+        return float(camera.height)
+    position, target = (torch.as_tensor(v, dtype=torch.float64) for v in (camera.position, camera.target))
+    return float((position - target).norm())
 
 
 def seconds_of_each(count: int) -> float:

@@ -163,7 +163,7 @@ def _colors(asked: ValueColors, shown: dict[str, Any], value_range: Range) -> Co
 def camera_of(scene: Scene, domain: Domain) -> Camera:
     """The camera of a scene: of a slice one in front of it, unless the scene has another."""
     view = scene.camera
-    if scene.slice is None or view.direction is not None or view.position is not None:
+    if scene.slice is None or not view.framed:
         return view.build(domain, scene.size)
     plane = scene.slice.plane(domain)
     return plane.camera(domain, up=view.up, aspect=view.aspect(scene.size), margin=view.margin, window=view.window)

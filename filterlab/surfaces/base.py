@@ -15,7 +15,6 @@ is 0, at tangents, a hit has no derivative, and gets 0. The same where it is not
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,9 +24,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, all_finite, as_tensor
 from filterlab.fields.base import Domain, check_order, type_of_rays
-from filterlab.ops.differentiable.recording import transforming
+from filterlab.ops.differentiable import hit_points
+from filterlab.ops.differentiable.recording import plain, transforming
+from filterlab.ops.reference.hit_points import along, chosen, length, spread
 
 MAX_SHEETS = 4096
 _STEPS = 2  # of Newton's method: derivatives up to the second
@@ -224,9 +225,30 @@ class Surface(ABC):
         if self.in_pieces and hit.piece is None:
             raise ValueError(f"hits of {type(self).__name__} tell which piece is hit; got hits with piece=None")
         index = _where(hit.valid)
-        o, d = _chosen(index, shape, origins, directions)
+        if order == 1 and self._is_plain(origins, directions, hit):
+            found = self._at_once(origins, directions, hit, index)
+            if found is not None:
+                return found
+        o, d = chosen(index, shape, origins, directions)
         rows = self._known(o, d, hit.at(index), order)
-        return SurfacePoints(*_spread([row for row in rows if row is not None], index, shape))
+        return SurfacePoints(*spread([row for row in rows if row is not None], index, shape))
+
+    def _is_plain(self, origins: Tensor, directions: Tensor, hit: Hits) -> bool:
+        """Whether points are on the rays, gradients those of the jet, and no derivative is asked."""
+        if not origins.numel() or not plain(origins, directions, hit.t):
+            return False
+        asked = torch.is_grad_enabled() and self._asked(origins, directions)
+        return not asked and not self._far_from(origins)
+
+    def _at_once(self, origins: Tensor, directions: Tensor, hit: Hits, index: Tensor) -> SurfacePoints | None:
+        """What is known up to order 1, of rows of hits that are made, and brought to the rays, in one pass each.
+
+        None: some gradient is not known, beside what is missing.
+        """
+        point = hit_points.points(origins, directions, hit.t, index)
+        piece = None if hit.piece is None else hit.piece.flatten().index_select(0, index)
+        found = hit_points.by_rays(index, hit.t.shape, point, self.jet(point, 1, piece)[1])
+        return None if found.unknown else SurfacePoints(*found[:3])
 
     def _known(self, origins: Tensor, directions: Tensor, hit: Hits, order: int) -> SurfacePoints:
         """What is known at hits (M,) of rays (M, 3)."""
@@ -279,7 +301,7 @@ class Surface(ABC):
         index = _where(hit.valid)
         if not len(index) or not self._follows(index[:1], hit, origins, directions):
             return hit
-        o, d = _chosen(index, hit.t.shape, origins, directions)
+        o, d = chosen(index, hit.t.shape, origins, directions)
         return hit.with_at(index, self._moving(o, d, hit.at(index)))
 
     def _asked(self, *rays: Tensor) -> bool:
@@ -289,9 +311,9 @@ class Surface(ABC):
 
     def _follows(self, index: Tensor, hit: Hits, origins: Tensor, directions: Tensor) -> bool:
         """Whether those hits move with anything that derivatives are asked by."""
-        o, d = _chosen(index, hit.t.shape, origins, directions)
+        o, d = chosen(index, hit.t.shape, origins, directions)
         own = hit.at(index)
-        return self._value(_along(o, d, own.t), own.piece).requires_grad
+        return self._value(along(o, d, own.t), own.piece).requires_grad
 
     def _moving(self, origins: Tensor, directions: Tensor, hit: Hits) -> Hits:
         """Hits (M,) of rays (M, 3), with derivatives."""
@@ -302,22 +324,30 @@ class Surface(ABC):
 
     def _stepped(self, origins: Tensor, directions: Tensor, t: Tensor, piece: Tensor | None) -> Tensor:
         """t (M,) with the derivatives of steps of Newton's method."""
-        slope = self._slope(_along(origins, directions, t), directions, piece)
+        slope = self._slope(along(origins, directions, t), directions, piece)
         for _ in range(_STEPS):
-            value = self._value(_along(origins, directions, t), piece)
+            value = self._value(along(origins, directions, t), piece)
             t = t - torch.where(value.isnan(), 0, value - value.detach()) / slope
         return t
 
     def _polished(self, origins: Tensor, directions: Tensor, t: Tensor, piece: Tensor | None) -> Tensor:
         """o + t d; far from where rays begin moved along them by what it was rounded by."""
-        point = _along(origins, directions, t)
-        near = _FAR * (self.domain.diagonal + max(map(abs, self.domain.center)))
-        if not len(t) or max(map(abs, torch.stack(origins.detach().aminmax()).tolist())) <= near:
+        point = along(origins, directions, t)
+        if not len(t) or not self._far_from(origins):
             return point
-        far = origins.detach().abs().amax(-1) > near  # t d leads as far, for what is hit is near
+        far = origins.detach().abs().amax(-1) > self._reach  # t d leads as far, for what is hit is near
         own = None if piece is None else piece[far]
         moved = self.detached._nearer(point.detach()[far], directions.detach()[far], own).detach()
         return point.index_add(0, far.nonzero()[:, 0], moved)
+
+    @property
+    def _reach(self) -> float:
+        """From the world's origin so far rays begin whose points need not be polished."""
+        return _FAR * (self.domain.diagonal + max(map(abs, self.domain.center)))
+
+    def _far_from(self, origins: Tensor) -> bool:
+        """Whether any of some rays begins farther away."""
+        return max(map(abs, torch.stack(origins.detach().aminmax()).tolist())) > self._reach
 
     def _nearer(self, points: Tensor, directions: Tensor, piece: Tensor | None) -> Tensor:
         """By what points (M, 3) come nearer to the surface along rays: steps of Newton's method that lower |F|."""
@@ -347,12 +377,12 @@ class _Attached(torch.autograd.Function):
         if torch.is_grad_enabled():
             t = _Attached.apply(ctx.surface, ctx.piece, t, origins, directions, *tensors)
             tensors = [x.view_as(x) for x in tensors]  # t depends on them as well
-            points = _along(origins, directions, t)
+            points = along(origins, directions, t)
             value = ctx.surface.with_tensors(tensors)._value(points, ctx.piece)
             (gradient,) = torch.autograd.grad(value.sum(), points, create_graph=True)
         else:
             tensors = [x.detach().requires_grad_(need) for x, need in zip(tensors, needed, strict=True)]
-            points = _along(origins, directions, t)
+            points = along(origins, directions, t)
             value, gradient = ctx.surface._differentiated(points, ctx.piece, tensors)
         gradient = torch.where(gradient.isnan(), 0, gradient)
         weight = -cotangents[0] / _along_rays(gradient, directions)
@@ -387,7 +417,7 @@ def check_rays(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     origins, directions = as_tensor(origins), as_tensor(directions)
     rays = _broadcast(origins, directions)
     for name, x in (("origins", origins), ("directions", directions)):
-        if not all_finite(x.detach()):
+        if not all_finite(x):
             wrong = int((~x.detach().isfinite()).any(-1).sum())
             raise ValueError(f"{name} must be finite; {wrong} rays are not")
     some_zero = int(directions.detach().count_nonzero()) < directions.numel()
@@ -416,15 +446,6 @@ def _broadcast(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     return o, d
 
 
-def all_finite(x: Tensor) -> bool:
-    """Whether all numbers are: a finite sum has finite terms; finite terms may have another one."""
-    return math.isfinite(float(x.sum())) or bool(x.isfinite().all())
-
-
-def _along(origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
-    return origins + t[..., None] * directions
-
-
 def _where(mask: Tensor) -> Tensor:
     """Places of what is true in the flat mask; numpy finds them in a tenth of torch's time."""
     flat = mask.flatten()
@@ -434,19 +455,6 @@ def _where(mask: Tensor) -> Tensor:
 def _unknown(rows: Sequence[Tensor]) -> Tensor:
     """(M,) whether any number of rows (M, …) is NaN."""
     return torch.stack([row.detach().flatten(1).isnan().any(1) for row in rows]).any(0)
-
-
-def _chosen(index: Tensor, shape: torch.Size, *rows: Tensor) -> list[Tensor]:
-    """Of rows that broadcast to (*shape, k), those at flat places: (M, k)."""
-    return [x.expand(*shape, x.shape[-1]).reshape(-1, x.shape[-1]).index_select(0, index) for x in rows]
-
-
-def _spread(rows: Sequence[Tensor], index: Tensor, shape: torch.Size) -> list[Tensor]:
-    """Rows (M, …) at flat places of (*shape, …), 0 elsewhere."""
-    joined = torch.cat([row.flatten(1) for row in rows], 1)
-    out = joined.new_zeros(shape.numel(), joined.shape[1]).index_copy_(0, index, joined)
-    parts = out.split([math.prod(row.shape[1:]) for row in rows], 1)
-    return [part.reshape(*shape, *row.shape[1:]) for part, row in zip(parts, rows, strict=True)]
 
 
 # --- the geometry of a level set --------------------------------------------------------------------------------------
@@ -459,12 +467,6 @@ def geometry(point: Tensor, derivatives: tuple[Tensor, ...]) -> SurfacePoints:
     if not hessian:
         return SurfacePoints(point, gradient, normal)
     return SurfacePoints(point, gradient, normal, *_curvatures(normal, hessian[0] / size[..., None, None]))
-
-
-def length(vectors: Tensor) -> Tensor:
-    """|v|, with a finite derivative where v is 0: there it is 1."""
-    square = (vectors * vectors).sum(-1)
-    return torch.where(square == 0, 1, square).sqrt()
 
 
 def _curvatures(normal: Tensor, hessian: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,7 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
+from filterlab.arrays import Array, all_finite, as_tensor
 from filterlab.fields.base import Domain, check_order
 from filterlab.missing_values import filled
 from filterlab.names import NAN_CHOICES
@@ -37,7 +37,7 @@ from filterlab.ops.differentiable import heights as jets
 from filterlab.ops.gather import STORAGE
 from filterlab.ops.reference import heights as reference
 from filterlab.surfaces import sight
-from filterlab.surfaces.base import Hits, Surface, all_finite, check_rays
+from filterlab.surfaces.base import Hits, Surface, check_rays
 from filterlab.surfaces.level_set import RAYS_AT_ONCE
 from filterlab.surfaces.quartic import quartic_spline
 from filterlab.surfaces.relief import Relief
@@ -349,7 +349,7 @@ def _resolved(heights: Tensor, choice: str) -> Tensor:
     """Heights that are finite, or NaN where they are holes."""
     if choice not in NAN_CHOICES:
         raise ValueError(f"nan must be one of {', '.join(NAN_CHOICES)}; got {choice!r}")
-    if not heights.dtype.is_floating_point or all_finite(heights.detach()):
+    if not heights.dtype.is_floating_point or all_finite(heights):
         return heights
     unknown = ~heights.detach().isfinite()
     if choice == "refuse":

@@ -35,9 +35,10 @@ from torch import Tensor
 from filterlab.arrays import Array
 from filterlab.fields.base import Domain
 from filterlab.ops.differentiable import slim as ops
+from filterlab.ops.reference.hit_points import length
 from filterlab.ops.reference.slim import weight
 from filterlab.ops.slim import Cover, Members
-from filterlab.surfaces.base import Hits, Surface, SurfacePoints, geometry, length
+from filterlab.surfaces.base import Hits, Surface, SurfacePoints, geometry
 from filterlab.surfaces.bounds import Spheres, check_rows, plane_distances
 from filterlab.surfaces.quadrics import Quadrics
 
@@ -226,6 +227,9 @@ class Slim(Surface):
         t = hit.blend[:, _T] + (t - t.detach())  # it keeps its bits
         blend = torch.cat((t[:, None], hit.blend[:, _ENDS], sums[:, 2:]), 1)
         return replace(hit, t=t.to(hit.t.dtype), blend=blend)
+
+    def _is_plain(self, origins: Tensor, directions: Tensor, hit: Hits) -> bool:
+        return False  # gradients at hits are blended
 
     def _known(self, origins: Tensor, directions: Tensor, hit: Hits, order: int) -> SurfacePoints:
         """The point is on the ray; gradient and Hessian are means of unit normals and of H / |∇F|."""

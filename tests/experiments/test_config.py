@@ -136,7 +136,7 @@ def test_the_sampled_scheme_says_which_gradient_it_gives():
 
 def test_seed_and_device_hold_for_sections_without_their_own():
     _, _, config = load("demo", {"seed": "7", "sections.3.seed": "0"})
-    assert [part.seed for part in config.sections] == [7, 7, 7, 0, 7]
+    assert [part.seed for part in config.sections] == [7, 7, 7, 0, 7, 7]
     again = loads_config(dump_config(config), type(config))
     assert again == config
     assert dump_config(again) == dump_config(config)

@@ -173,6 +173,7 @@ def tiny(name, scan):
         "pieces": 3,
         "boundaries": 1,
         "budgets": 2,
+        "methods": ["trilinear", "triquadratic"],
         "points": 200,
         "seconds": 0.01,
     }
@@ -204,10 +205,11 @@ def tiny(name, scan):
                     "title": "a ridge",
                     "heights": str(ridge(scan.with_name("ridge.npz"))),
                     "views": [
-                        {"title": "as it is", "scene": {"size": [12, 8], "subpixels": 1}},
+                        {"title": "as it is", "size": [12, 8], "terrain": {"subpixels": 1}},
                         {
                             "title": "a flight",
-                            "scene": {"size": [12, 8], "subpixels": 1, "haze": 500},
+                            "size": [12, 8],
+                            "terrain": {"subpixels": 1, "haze": 500},
                             "flight": {"points": [[5, 30, 20], [40, 35, 20]]},
                             "frames": 2,
                         },

@@ -15,7 +15,7 @@ from filterlab.recommendation.calibration import CALIBRATION, FALLS
 
 
 def candidate(method: str, seconds: float, low: float, high: float) -> Candidate:
-    error = ErrorEstimate((low + high) / 2, 0.0, low, high)
+    error = ErrorEstimate((low + high) / 2, 0.0, low, high, high)
     return Candidate(method, "fused", None, None, error, True, seconds, 1.0, 8)
 
 
@@ -88,8 +88,9 @@ def test_factors_are_those_with_which_intervals_would_just_have_held() -> None:
     below = [[1.0, 0.0, 1 - factor * u] for factor in np.linspace(0, 2, 1001)]
     found = fitted([record(FALLS[3], u, above), record(FALLS[6], u, below)])
     for quantity in ("value", "gradient"):
-        least, most = found[quantity]
+        least, most, likely = found[quantity]
         assert most[3] == pytest.approx(0.97 * 5, rel=0.01)
+        assert likely[3] == pytest.approx(0.85 * 5, rel=0.01)
         assert least[6] == pytest.approx(0.97 * 2, rel=0.01)
         assert least[3] == most[6] == pytest.approx(0, abs=1e-6)
         assert least[0] == math.inf  # nothing near

@@ -413,6 +413,35 @@ def test_npy_sidecar_comes_and_goes(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a.npy"]
 
 
+def test_samples_of_npy_never_lie_beside_a_geometry_that_is_not_theirs(tmp_path: Path, monkeypatch) -> None:
+    """Whenever a name comes or goes: a process that is killed there leaves one volume or the other, or none."""
+    path, samples, watched = tmp_path / "a.npy", torch.arange(24.0).reshape(2, 3, 4), []
+    volumes = [Volume(samples, spacing=(1, 2, 3)), Volume(samples.flip(0), spacing=(3, 2, 1)), Volume(samples.flip(1))]
+
+    def is_whole() -> bool:
+        try:
+            found = load_volume(path)
+        except FileNotFoundError:
+            return True
+        return any(torch.equal(found.samples, v.samples) and found.geometry == v.geometry for v in volumes)
+
+    def watching(own):
+        def watched_call(*arguments, **options):
+            watched.append(is_whole())
+            own(*arguments, **options)
+            watched.append(is_whole())
+
+        return watched_call
+
+    for name in ("replace", "unlink"):
+        monkeypatch.setattr(os, name, watching(getattr(os, name)))
+    for i in (0, 1, 2, 0, 2, 1):
+        save_volume(volumes[i], path)
+        assert torch.equal(load_volume(path).samples, volumes[i].samples)
+    assert len(watched) > 24
+    assert all(watched)
+
+
 def test_raw_sidecar(tmp_path: Path) -> None:
     samples = SAMPLES.astype(">u2")
     path = write_raw(tmp_path / "a.raw", samples, "spacing: [1, 2, 3]\norigin: [4, 5, 6]\n")

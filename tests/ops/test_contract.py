@@ -48,7 +48,7 @@ def dense(rows: Rows) -> np.ndarray:
 
 def by_matrices(samples: np.ndarray, given: Contraction) -> np.ndarray:
     terms = [[dense(rows) for rows in term] for term in given.terms]
-    return sum(np.einsum("kc,jb,ia,...cba->...kji", z, y, x, samples) for x, y, z in terms)
+    return sum(np.einsum("kc,jb,ia,...cba->...kji", z, y, x, samples, optimize=True) for x, y, z in terms)
 
 
 def random(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:

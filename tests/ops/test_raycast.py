@@ -16,7 +16,7 @@ from filterlab.ops import cpu
 from filterlab.ops.cpu import machine
 from filterlab.ops.cpu import raycast as vector_code
 from filterlab.ops.differentiable import raycast
-from filterlab.ops.raycast import Raycast, marks_of
+from filterlab.ops.raycast import Raycast, bits_of
 from tests.test_methods import CONTINUOUS, TENSOR_PRODUCTS
 
 AFFINE = [[1.5, 0.2, 0.1, 3.0], [0.0, -0.8, 0.3, -2.0], [0.1, 0.0, 2.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
@@ -206,10 +206,11 @@ def test_what_cannot_run_is_said_and_runs_plainly(monkeypatch):
     assert torch.allclose(plain, expected, rtol=0, atol=1e-12)  # its prefilter is another one
 
 
-def test_clear_bricks_are_as_far_from_the_others_as_is_said():
+@pytest.mark.parametrize("implementation", ["reference", "cpu"])
+def test_clear_bricks_are_as_far_from_the_others_as_is_said(implementation):
     g = torch.Generator().manual_seed(0)
     parts = torch.rand(41, 11, 94, generator=g) < 0.0002
-    marks = marks_of(parts)
+    marks = raycast.marks_of_bits(bits_of(torch.nn.functional.pad(parts, (0, 0, 0, 1, 0, 1))), implementation)
     assert marks.shape == (21, 6, 47)
     clear, relevant = (-marks).clamp_min(0), marks > 0
     assert set(clear.unique().tolist()) == set(range(10))

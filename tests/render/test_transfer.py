@@ -60,6 +60,15 @@ def test_optical_depth_keeps_the_digits_of_tiny_opacities_and_is_infinite_at_one
         assert derivative.isfinite().all()
 
 
+def test_peaks_that_touch_up_to_rounding_share_a_point():
+    """0.5 + 0.4 / 2 and 0.8 − 0.2 / 2 are two numbers in float64, and one in float32."""
+    transfer = TransferFunction.triangle_peaks([(0.5, 0.4, 0.2, (1, 0, 0)), (0.8, 0.2, 0.3, (0, 1, 0))])
+    assert len(transfer.positions) == 5
+    color, opacity = transfer.to(torch.float32)(torch.tensor([0.5, 0.7, 0.8]))
+    assert torch.equal(opacity, torch.tensor([0.2, 0.0, 0.3]))
+    assert torch.equal(color[[0, 2]], torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+
+
 def test_triangle_peaks_are_the_sum_of_triangles():
     peaks = [(0.3, 0.2, 0.1, (1.0, 0.0, 0.0)), (0.5, 0.4, 0.6, (0.0, 0.0, 1.0)), (0.9, 0.1, 0.2, (0.0, 1.0, 0.0))]
     transfer = TransferFunction.triangle_peaks(peaks, unit=0.5)

@@ -3,32 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
+from llvmlite import ir
+
 from filterlab.ops.bilinear import ACROSS, CENTER, CORNER, LENGTH, PLACE, SQUARE, TWIST, UP
-from filterlab.ops.cpu import frame
 from filterlab.ops.cpu.lanes import DOUBLE, I64, Value
-from filterlab.ops.cpu.tree_walk import Ray, Rows
-from filterlab.ops.quadrics import Kept
+from filterlab.ops.cpu.tree_walk import Ray, Rows, RowsVariant
 from filterlab.ops.tree import WIDTH
 
 _ROWS = PLACE + 1
 
 
-@dataclass(frozen=True)
-class BilinearVariant:
-    """Everything the program depends on, apart from the machine; attributes as of `ops.cpu.tree_walk.WalkVariant`."""
+class BilinearVariant(RowsVariant):
+    """See `ops.cpu.tree_walk.RowsVariant`."""
 
-    kept: Kept
-    reversed: bool
-    fused: bool
-
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
-        _Program(self, function).write()
-        return str(module)
+    def program(self, function: ir.Function) -> Rows:
+        return _Program(self, function)
 
 
 class _Patch(NamedTuple):

@@ -12,6 +12,7 @@ from torch import Tensor
 from filterlab.ops.bounds import Bounds, Codes
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
+from filterlab.ops.cpu.block_bits import BlockBitsJob, BlockBitsVariant
 from filterlab.ops.cpu.hulls import HullsJob, HullsVariant
 from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.gather import STORAGE, in_whole_rows
@@ -19,6 +20,7 @@ from filterlab.ops.pieces import Lattice
 from filterlab.ops.tetrahedra import AnyLattice
 
 _LAYERS = 32  # of cells at a time, where they are joined to parts
+_BLOCKS = 256  # of a chunk
 
 
 def bounds(lattice: AnyLattice, edge: int, codes: Codes) -> Bounds:
@@ -74,3 +76,13 @@ def _joined(cells: np.ndarray, edge: int, least: np.ufunc) -> np.ndarray:
         least(joined[: len(second)], second, out=joined[: len(second)])
         cells = joined.swapaxes(0, axis)
     return cells
+
+
+def bits_of_blocks(low: Tensor, high: Tensor, least: Tensor, most: Tensor, below: int, above: int) -> Tensor:
+    """`ops.reference.bounds.bits_of_blocks`, fused."""
+    bits = np.empty((len(low), 4, 4, 4), np.uint8)
+    job = BlockBitsJob(below=below, above=above, blocks=len(low), chunk=_BLOCKS, chunks=-(-len(low) // _BLOCKS))
+    codes = {"low": low, "high": high, "least": least, "most": most}
+    job.point(bits=bits, **{name: own.contiguous() for name, own in codes.items()})
+    pool.run(compiler.compiled(BlockBitsVariant()), [job] * max(1, min(torch.get_num_threads(), job.chunks)))
+    return torch.from_numpy(bits)

@@ -126,17 +126,34 @@ def _machine() -> llvm.TargetMachine:
     )
 
 
+_PASSES = (
+    "sroa",
+    "simplify_cfg",
+    "instruction_combine",
+    "reassociate",
+    "new_gvn",
+    "loop_rotate",
+    "dead_store_elimination",
+    "simplify_cfg",
+    "instruction_combine",
+)
+"""What LLVM does before it chooses instructions: of the passes of -O2 those that change our programs.
+
+Measured: 0.29 of the time of the passes of -O2, and as fast code: 35 kinds of work take 0.986 of their time in mean.
+Sums are rounded alike, but for those of SLIM surfaces and of jets of heights, where the last bit may differ.
+"""
+
+
 def _compile(variant: Variant) -> bytes:
     """An object file. Our programs have vectors and loops as they should be: LLVM shall not rearrange them."""
     machine = _machine()
     module = llvm.parse_assembly(variant.generate())
     module.triple = machine.triple
     module.verify()
-    options = llvm.create_pipeline_tuning_options(speed_level=2)
-    options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
-    llvm.create_pass_builder(machine, options).getModulePassManager().run(
-        module, llvm.create_pass_builder(machine, options)
-    )
+    passes = llvm.create_new_module_pass_manager()
+    for name in _PASSES:
+        getattr(passes, f"add_{name}_pass")()
+    passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
     return machine.emit_object(module)
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from llvmlite import ir
@@ -105,6 +106,20 @@ class Kept:
         return b.load(b.gep(self._place, [index], source_etype=self._element), typ=self._element)
 
 
+# Constants are made once for all programs: to write the text of one takes as long as to write some instructions.
+
+
+@cache
+def _everywhere(pack: ir.VectorType, number: str) -> Value:
+    """A number, in hexadecimal digits (0 and −0 are equal, their texts are not), in every lane."""
+    return ir.Constant(pack, [float.fromhex(number)] * pack.count)
+
+
+@cache
+def _pattern(*lanes: int) -> Value:
+    return ir.Constant(ir.VectorType(I32, len(lanes)), list(lanes))
+
+
 class Lanes:
     """Writes instructions at the end of the current block.
 
@@ -126,7 +141,7 @@ class Lanes:
 
     def constant(self, value: float) -> Value:
         """The same number in every lane."""
-        return ir.Constant(self.pack, [float(value)] * self.count)
+        return _everywhere(self.pack, float(value).hex())
 
     def add(self, a: Value, b: Value) -> Value:
         return self.builder.fadd(a, b, flags=FLAGS)
@@ -286,7 +301,7 @@ class Lanes:
         return self.shuffle(first, first, [0] * self.count)
 
     def shuffle(self, a: Value, b: Value, pattern: Sequence[int]) -> Value:
-        return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(pattern)), list(pattern)))
+        return self.builder.shuffle_vector(a, b, _pattern(*pattern))
 
     def join(self, vectors: Sequence[Value]) -> Value:
         """Vectors laid end to end; their number is a power of two."""
@@ -463,9 +478,10 @@ class Lanes:
         """`size` bytes."""
         self._intrinsic("llvm.memcpy.p0.p0.i64", ir.VoidType(), [target, source, size, I1(0)])
 
-    def clear(self, target: Value, size: int) -> None:
+    def clear(self, target: Value, size: int | Value) -> None:
         """`size` bytes of zeros."""
-        self._intrinsic("llvm.memset.p0.i64", ir.VoidType(), [target, I8(0), I64(size), I1(0)])
+        size = I64(size) if isinstance(size, int) else size
+        self._intrinsic("llvm.memset.p0.i64", ir.VoidType(), [target, I8(0), size, I1(0)])
 
     def _intrinsic(self, name: str, result: ir.Type, arguments: list[Value]) -> Value:
         """Call one of LLVM's own functions, declared at its first use."""

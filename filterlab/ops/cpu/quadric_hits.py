@@ -4,27 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from filterlab.ops.cpu import frame
+from llvmlite import ir
+
 from filterlab.ops.cpu.lanes import Value
 from filterlab.ops.cpu.quadric_leaves import Met, QuadricLeaves
-from filterlab.ops.cpu.tree_walk import Ray, Rows
-from filterlab.ops.quadrics import Kept
+from filterlab.ops.cpu.tree_walk import Ray, Rows, RowsVariant
 
 
 @dataclass(frozen=True)
-class QuadricsVariant:
-    """Everything the program depends on, apart from the machine; see `quadric_leaves.QuadricLeavesVariant`."""
+class QuadricsVariant(RowsVariant):
+    """See `quadric_leaves.QuadricLeavesVariant`."""
 
     planes: int
-    kept: Kept
-    reversed: bool
-    fused: bool
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
-        _Program(self, function).write()
-        return str(module)
+    def program(self, function: ir.Function) -> Rows:
+        return _Program(self, function)
 
 
 class _Program(QuadricLeaves, Rows):

@@ -22,7 +22,7 @@ def hits(
     given: Quadrics, origins: Tensor, directions: Tensor, sheets: int, farthest: bool = False
 ) -> tuple[Tensor, Tensor]:
     """`ops.reference.quadrics.hits`, fused."""
-    variant = QuadricsVariant(given.planes, given.kept(farthest), farthest, has_fma())
+    variant = QuadricsVariant(given.kept(farthest), farthest, has_fma(), given.planes)
     return walked(given, variant, origins, directions, sheets, farthest)
 
 

@@ -6,17 +6,19 @@ each of the `capacity` that there is room for.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
+from filterlab.ops.cpu.clear_bricks import WORD, ClearBricksJob, ClearBricksVariant
 from filterlab.ops.cpu.crossings import PACKS_OF_A_CHUNK, RaycastJob, RaycastVariant
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.cpu.memory import ARITHMETIC, has_room
 from filterlab.ops.gather import STORAGE, in_whole_rows
-from filterlab.ops.raycast import Candidates, Raycast, Written, written_in_parts
+from filterlab.ops.raycast import RADII, Candidates, Raycast, Written, written_in_parts
 
 _WASTED = 17 / 16  # places for rays in packs of two rows, over rays: more would take back most of what is gained
 
@@ -42,6 +44,21 @@ def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidate
         return written
 
     return written_in_parts(write, given.lattice.degree, len(origins), origins.device)
+
+
+def marks_of_bits(bits: Tensor) -> Tensor:
+    """`ops.raycast.marks_of_bits`, by a program; memory: 11 bits for every brick."""
+    planes, rows, columns = bits.shape
+    words = -(-columns // WORD)
+    padded = np.pad(bits.numpy(), ((0, 0), (0, 0), (0, words * WORD - columns)))
+    near = np.zeros((RADII[-1] + 1, planes + 2, rows + 2, words + 1), np.uint64)
+    near[0, 1:-1, 1:-1, :-1] = np.packbits(padded > 0, axis=-1, bitorder="little").view(np.uint64)
+    between = np.zeros((2, *near.shape[1:]), np.uint64)
+    marks = np.empty(padded.shape, np.int16)
+    job = ClearBricksJob(planes=planes, rows=rows, words=words, chunks=1)
+    job.point(near=near, along_x=between[0], along_y=between[1], bits=padded, marks=marks)
+    pool.run(compiler.compiled(ClearBricksVariant(RADII[-1])), [job])
+    return torch.from_numpy(np.ascontiguousarray(marks[..., :columns]))
 
 
 class _Cast:

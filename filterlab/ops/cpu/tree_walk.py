@@ -330,3 +330,22 @@ class Rows(Walk):
             b.store(tau, e.advance(self.taus, self.slot.value, DOUBLE))
             b.store(place, e.advance(self.places, self.slot.value, I64))
             self.limit.value = self.number(self.taus, last)
+
+
+@dataclass(frozen=True)
+class RowsVariant(ABC):
+    """Everything a program of rows depends on, apart from the machine; attributes as of `WalkVariant`."""
+
+    kept: Kept
+    reversed: bool
+    fused: bool
+
+    @abstractmethod
+    def program(self, function: ir.Function) -> Rows:
+        """What is to be written."""
+
+    def generate(self) -> str:
+        """The program as LLVM IR text."""
+        module, function = frame.new_module()
+        self.program(function).write()
+        return str(module)

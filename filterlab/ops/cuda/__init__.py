@@ -1,11 +1,11 @@
 """Every op in Triton: one program per stencil (the prefilter's: per number of poles), compiled at its first use.
 
-`gather`, `prefilter`, `march`, `raycast` and `heights` describe arrays to programs and launch them; `points`,
-`recursion`, `compositing`, `adjoint`, `crossings` and `height_jets` write those programs, from the sums of `taps` (read
-it first; of splines on tetrahedra `tetrahedra`) and what `segments` and `cells` know of rays; `launch` hands their text
-to Triton, which keeps what it has compiled on disk. With TRITON_INTERPRET=1 in the environment the same programs run on
-tensors of the CPU, in Triton's interpreter: slowly, to test them where there is no GPU. What is here can be asked
-without Triton: whether they can run at all.
+`gather`, `prefilter`, `march`, `raycast`, `heights`, `height_hits`, … describe arrays to programs and launch them;
+`points`, `recursion`, `compositing`, `adjoint`, `crossings`, `height_jets`, `height_rays`, … write those programs,
+from the sums of `taps` (read it first; of splines on tetrahedra `tetrahedra`) and what `segments` and `cells` know of
+rays; `launch` hands their text to Triton, which keeps what it has compiled on disk. With TRITON_INTERPRET=1 in the
+environment the same programs run on tensors of the CPU, in Triton's interpreter: slowly, to test them where there is
+no GPU. What is here can be asked without Triton: whether they can run at all.
 """
 
 from __future__ import annotations

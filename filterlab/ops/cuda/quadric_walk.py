@@ -7,7 +7,6 @@ Boxes are float32, quadrics float64, both as `ops.reference.quadrics` says.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable, Sequence
 
 from filterlab.ops.cuda.source import Source, any_of, number
@@ -33,11 +32,8 @@ class Walk:
 
     def __init__(self, name: str, arrays: Sequence[str], sizes: Sequence[str], planes: int, kept: Kept, reversed: bool):
         self.source = Source(name, (*ARRAYS, *arrays, *sizes, "rays", "BLOCK: tl.constexpr"))
+        self.text = self.source.lines
         self.planes, self.kept, self.reversed = planes, kept, reversed
-
-    def text(self, lines: str) -> None:
-        for line in textwrap.dedent(lines).strip("\n").splitlines():
-            self.source.line(line)
 
     def begin(self) -> None:
         """The rays of the block: `ray`, `inside`, and all that stays the same on their walks."""

@@ -6,6 +6,7 @@ are written by other functions (`taps`, `points`) and launched by `launch`.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -20,6 +21,11 @@ class Source:
 
     def line(self, text: str) -> None:
         self._lines.append("    " * self._depth + text)
+
+    def lines(self, text: str) -> None:
+        """Several of them, as deep as they stand to one another."""
+        for line in textwrap.dedent(text).strip("\n").splitlines():
+            self.line(line)
 
     def named(self, expression: str) -> str:
         """Its value by a name that nothing else in the program has: within loops and branches names keep their type."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 
 from filterlab.ops import cpu
 from filterlab.ops.bounds import Bounds, Codes
@@ -43,3 +44,19 @@ def bounds(lattice: AnyLattice, edge: int, codes: Codes, implementation: str | N
         many = math.prod(lattice.cells) >= _FEWEST
         implementation = "cpu" if many and missing(lattice) is None else "reference"
     return driver(implementation, "bounds").bounds(lattice, edge, codes)
+
+
+def bits_of_blocks(
+    low: Tensor,
+    high: Tensor,
+    least: Tensor,
+    most: Tensor,
+    below: int,
+    above: int,
+    implementation: str | None = None,
+) -> Tensor:
+    """Which parts of K blocks may hold a level, (K, 4, 4, 4) uint8; see `ops.reference.bounds.bits_of_blocks`."""
+    if implementation is None:
+        fused = low.device.type == "cpu" and low.numel() >= _FEWEST and cpu.llvmlite_problem() is None
+        implementation = "cpu" if fused else "reference"
+    return driver(implementation, "bounds").bits_of_blocks(low, high, least, most, below, above)

@@ -32,7 +32,7 @@ def described(heights: Heights, implementation: str | None = None) -> HeightHits
     """What is cast, of one grid: with bounds of all blocks, which are found here.
 
     Args:
-        implementation: "reference" or "cpu"; None: the faster one that can run.
+        implementation: "reference", "cpu" or "cuda"; None: the faster one of the first two that can run.
     """
     cell, (columns, rows) = Cell.of(heights.pattern), heights.cells
     if implementation is None:
@@ -44,7 +44,8 @@ def first(given: HeightHits, origins: Tensor, directions: Tensor, implementation
     """t (R,) float64, where rays (R, 3) first meet the surface; ∞ where they don't. Without derivatives.
 
     Args:
-        implementation: "reference" or "cpu"; None: the faster one that can run.
+        implementation: "reference", "cpu" or "cuda", which has only run in the interpreter yet; None: the faster one of
+            the first two that can run.
     """
     return _driver(given, origins, implementation).first(given, origins, directions)
 

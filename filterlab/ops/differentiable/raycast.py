@@ -6,10 +6,14 @@ import torch
 from torch import Tensor
 
 from filterlab.ops import cpu, cuda
+from filterlab.ops import raycast as description
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.raycast import Candidates, Raycast
 from filterlab.ops.tetrahedra import AnyLattice
+
+_FEWEST = 1 << 13
+"""Bricks from which on a program is worth to be compiled for their marks."""
 
 
 def missing(given: Raycast, origins: Tensor) -> str | None:
@@ -43,6 +47,18 @@ def first(given: Raycast, origins: Tensor, directions: Tensor, implementation: s
 def candidates(given: Raycast, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Candidates:
     """The pieces of rays (R, 3) that may hold a crossing, those of a ray in order. Arguments as for `first`."""
     return _driver(given, origins, implementation).candidates(given, origins, directions)
+
+
+def marks_of_bits(bits: Tensor, implementation: str | None = None) -> Tensor:
+    """`ops.raycast.marks_of_bits`; `implementation` "reference" or "cpu", None: the faster one that can run."""
+    if implementation is None:
+        many = bits.numel() >= _FEWEST and bits.device.type == "cpu"
+        implementation = "cpu" if many and cpu.llvmlite_problem() is None else "reference"
+    return (
+        description.marks_of_bits(bits)
+        if implementation == "reference"
+        else driver("cpu", "raycast").marks_of_bits(bits)
+    )
 
 
 def _driver(given: Raycast, origins: Tensor, implementation: str | None):

@@ -6,36 +6,41 @@ written from what stands here: the text under every key, its type, default and u
 """
 
 from filterlab.scenes.model.colors import Color
-from filterlab.scenes.model.quantities import Component, Opacity, Pixels, Positive, Section, Vector
-from filterlab.scenes.model.reconstruction import AUTO, MethodName, Reconstruction, SceneMethod
-from filterlab.scenes.model.scene import STEP, Scene
-from filterlab.scenes.model.sources import VOLUMES_VARIABLE, SignalModel, SignalSource, VolumeFile, find_volume
-from filterlab.scenes.model.surface import (
+from filterlab.scenes.model.materials import (
     EnvironmentModel,
     MaterialModel,
     PhongModel,
     ReflectionLinesModel,
-    SurfaceModel,
     ToonModel,
 )
+from filterlab.scenes.model.quantities import Component, Opacity, Pixels, Positive, Section, Vector
+from filterlab.scenes.model.reconstruction import AUTO, MethodName, Reconstruction, SceneMethod
+from filterlab.scenes.model.scene import STEP, Scene
+from filterlab.scenes.model.sources import VOLUMES_VARIABLE, SignalModel, SignalSource, VolumeFile, find_volume
+from filterlab.scenes.model.surface import Cast, LevelSetModel, OnSurface, SurfaceOfItsOwn
+from filterlab.scenes.model.terrain import TerrainLook, TerrainModel
 from filterlab.scenes.model.transfer import ControlPoint, Peak, Transfer
 from filterlab.scenes.model.values import MipModel, SliceModel
-from filterlab.scenes.model.view import CameraView, Lighting, LightSource, Region
+from filterlab.scenes.model.view import CameraView, Compass, Lighting, LightSource, Region
 
 __all__ = [
     "AUTO",
     "STEP",
     "VOLUMES_VARIABLE",
     "CameraView",
+    "Cast",
     "Color",
+    "Compass",
     "Component",
     "ControlPoint",
     "EnvironmentModel",
+    "LevelSetModel",
     "LightSource",
     "Lighting",
     "MaterialModel",
     "MethodName",
     "MipModel",
+    "OnSurface",
     "Opacity",
     "Peak",
     "PhongModel",
@@ -50,7 +55,9 @@ __all__ = [
     "SignalModel",
     "SignalSource",
     "SliceModel",
-    "SurfaceModel",
+    "SurfaceOfItsOwn",
+    "TerrainLook",
+    "TerrainModel",
     "ToonModel",
     "Transfer",
     "Vector",

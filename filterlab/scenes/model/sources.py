@@ -65,7 +65,7 @@ class VolumeFile(Section):
         return load_volume(self.path(), frame=self.frame, channel=self.channel)
 
 
-def find_volume(name: str, folder: Path = Path()) -> Path:
+def find_volume(name: str, folder: Path = Path(), what: str = "a volume file") -> Path:
     """The existing file that `name` stands for (see `VolumeFile`), absolute. Raises ValueError if there is none."""
     package, colon, inside = name.partition(":")
     if colon and package.isidentifier() and len(package) > 1:  # one letter is a drive
@@ -82,12 +82,17 @@ def find_volume(name: str, folder: Path = Path()) -> Path:
             return (place / path).resolve()
     looked = " or ".join(dict.fromkeys(str((place / path).absolute()) for place in places))
     hint = "" if volumes or path.is_absolute() else f" (set {VOLUMES_VARIABLE} to the folder of your volumes)"
-    raise ValueError(f"expected a volume file; found none at {looked}{hint}")
+    raise ValueError(f"expected {what}; found none at {looked}{hint}")
 
 
 def folder_of(info: ValidationInfo) -> Path:
     """That of the file that is being read."""
     return Path((info.context or {}).get("folder", "."))
+
+
+def found(name: str, info: ValidationInfo, what: str) -> Path:
+    """`find_volume` for a key of the file that is being read, in which `what` stands."""
+    return find_volume(name, folder_of(info), what)
 
 
 def _packaged(package: str, inside: str) -> Path:

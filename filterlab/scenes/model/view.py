@@ -5,13 +5,18 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
+from torch import Tensor
 
 from filterlab.fields.base import Domain
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, PerspectiveCamera, Window, check_window
 from filterlab.render.rays import check_region
+from filterlab.render.scenery import toward
 from filterlab.render.shading import Light, Shading
 from filterlab.scenes.model.colors import Color
-from filterlab.scenes.model.quantities import Component, Positive, Section, Told, Vector
+from filterlab.scenes.model.quantities import LISTED, Component, Positive, Section, Told, Vector
+
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+Compass = Annotated[tuple[Degrees, Annotated[float, Field(ge=-90, le=90)]], LISTED]
 
 
 class CameraView(Section):
@@ -19,6 +24,7 @@ class CameraView(Section):
 
     examples = (
         "{direction: [-0.6, 0.75, -0.5], up: [0, 0, 1], field_of_view: 30, margin: 1.05, window: [0.1, 0.1, 0.9, 0.9]}",
+        "{compass: [20, 33]}",
         "{projection: orthographic, position: [64, -300, 64], target: [64, 64, 64], height: 150}",
     )
 
@@ -26,6 +32,9 @@ class CameraView(Section):
     """How it sees."""
     direction: Annotated[Vector, Told(unit="world, any length")] | None = None
     """In which it looks; the rest is framing. Left out, along y (along z where y is up)."""
+    compass: Annotated[Compass, Told("[azimuth, down]", "degrees")] | None = None
+    """Instead of a direction, as maps say it: clockwise from north (+y), and down from the horizontal. From straight
+    above, 90, the azimuth is up in the picture."""
     position: Annotated[Vector, Told(unit="world")] | None = None
     """Where it is, instead of a direction; with a `target`."""
     target: Annotated[Vector, Told(unit="world")] | None = None
@@ -45,27 +54,51 @@ class CameraView(Section):
     def _consistent(self) -> CameraView:
         if (self.position is None) != (self.target is None):
             raise ValueError("expected position and target together; got one of them")
-        if self.position is not None and self.direction is not None:
-            raise ValueError("expected either a direction or position and target; got both")
+        ways = {"a direction": self.direction, "a compass": self.compass, "position and target": self.position}
+        given = [name for name, value in ways.items() if value is not None]
+        if len(given) > 1:
+            raise ValueError(f"expected one of {', '.join(ways)}; got {' and '.join(given)}")
         with_height = self.projection == "orthographic" and self.position is not None
         if with_height != (self.height is not None):
             raise ValueError("height goes with an orthographic view of a given position and target, and only with that")
         self.build(Domain((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), (1, 1))
         return self
 
-    def build(self, domain: Domain, size: tuple[int, int]) -> Camera:
-        """The camera, for an image of that size."""
+    @property
+    def looking(self) -> Vector:
+        """The direction in which it looks."""
+        if self.compass is not None:
+            return toward(self.compass[0], -self.compass[1])
+        return self.direction or ((0.0, 0.0, 1.0) if self.up[0] == self.up[2] == 0 else (0.0, 1.0, 0.0))
+
+    def build(self, domain: Domain, size: tuple[int, int], points: Tensor | None = None) -> Camera:
+        """The camera, for an image of that size; in view are the domain, or world points (M, 3) in its stead."""
         if self.position is not None and self.target is not None:
-            pose = {"position": self.position, "target": self.target, "up": self.up, "window": self.window}
-            if self.projection == "perspective":
-                return PerspectiveCamera(**pose, field_of_view=self.field_of_view)
-            assert self.height is not None
-            return OrthographicCamera(**pose, height=self.height)
-        framing = {"up": self.up, "aspect": self.aspect(size), "margin": self.margin, "window": self.window}
-        direction = self.direction or ((0.0, 0.0, 1.0) if self.up[0] == self.up[2] == 0 else (0.0, 1.0, 0.0))
+            return self._at(self.position, self.target)
+        framing = {"up": self._up, "aspect": self.aspect(size), "margin": self.margin, "window": self.window}
+        kind = OrthographicCamera
         if self.projection == "perspective":
-            return PerspectiveCamera.framing(domain, direction, field_of_view=self.field_of_view, **framing)
-        return OrthographicCamera.framing(domain, direction, **framing)
+            kind, framing["field_of_view"] = PerspectiveCamera, self.field_of_view
+        if points is None:
+            return kind.framing(domain, self.looking, **framing)  # type: ignore[arg-type]
+        return kind.of_points(points, self.looking, **framing)  # type: ignore[arg-type]
+
+    def _at(self, position: Vector, target: Vector) -> Camera:
+        pose = {"position": position, "target": target, "up": self.up, "window": self.window}
+        if self.projection == "perspective":
+            return PerspectiveCamera(**pose, field_of_view=self.field_of_view)
+        assert self.height is not None
+        return OrthographicCamera(**pose, height=self.height)
+
+    @property
+    def _up(self) -> Vector:
+        straight = self.compass is not None and abs(self.compass[1]) == 90
+        return toward(self.compass[0], 0) if straight else self.up  # type: ignore[index]
+
+    @property
+    def framed(self) -> bool:
+        """Whether nothing is said of where it is and where it looks."""
+        return self.direction is None and self.compass is None and self.position is None
 
     def aspect(self, size: tuple[int, int]) -> float:
         """Width / height of the whole image plane, of which a picture of that size shows the window."""
