@@ -106,7 +106,7 @@ class Numbers:
 
 
 class Points:
-    """Those that a cover was fitted to, off a torus by noise, moved in units of their distance; fits are solved again."""
+    """Those that a cover was fitted to, off a torus by noise, moved in units of their distance: it is refitted."""
 
     def __init__(self, config: Config) -> None:
         even = covers.torus(config.points).centers
