@@ -46,6 +46,11 @@ def cube(count: int, seed: int = 0) -> np.ndarray:
     return x
 
 
+@cache
+def cube_cover() -> Slim:
+    return fit_slim(cube(4000))
+
+
 def diagonal(points: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(points, 0)))
 
@@ -269,3 +274,39 @@ def test_the_report_cannot_be_changed():
     with pytest.raises(AttributeError):
         fit.rms = 0.0  # type: ignore[misc]
     assert replace(fit, rms=0.0) != fit
+
+
+# --- corners ----------------------------------------------------------------------------------------------------------
+
+
+def test_corners_of_a_cube_are_sharp():
+    """Three planes in each ball there: no ball is left that rounds a corner off, and no point is off it."""
+    slim = cube_cover()
+    assert slim.fit is not None
+    assert slim.fit.smallest == 0
+    assert slim.fit.worst < 1e-6
+    assert slim.cuts is not None
+    rays = torch.tensor(np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3))
+    hit = slim.hit(3 * rays, -rays)  # down the diagonals
+    assert hit.valid.all()
+    assert hit.t.numpy() == pytest.approx(2.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_nothing_of_a_cube_reaches_beyond_its_edges(axis):
+    random = np.random.default_rng(axis)
+    o = random.uniform(-1.1, 1.1, (4000, 3))
+    across, other = (axis + 1) % 3, (axis + 2) % 3
+    o[:, axis], o[:, across] = 3, np.sign(o[:, other]) * random.uniform(1 + 1e-3, 1.1, 4000)
+    origins = torch.from_numpy(o)
+    direction = torch.zeros_like(origins)
+    direction[:, axis] = -1
+    assert not cube_cover().hit(origins, direction).valid.any()
+
+
+def test_normals_near_an_edge_are_of_one_of_its_sides():
+    from filterlab.surfaces.fitting.scans import scan_of
+
+    points = torch.from_numpy(cube(4000)) / 12**0.5
+    scan, _ = scan_of(points, points, 0, lambda part: None)
+    assert float((scan.normals.abs().amax(1) > 0.999).double().mean()) > 0.9

@@ -7,7 +7,8 @@ is kept whatever its misfit. A point is covered when the weights of the balls th
 
 A ball meets the tolerance if the root of the weighted mean of squared distances of its points is within it, and none
 is further off than four times that. Points whose normals look the other way, as those of a wall behind, are not its
-own. If one graph does not meet it, two are tried that share a sharp edge (`surfaces.fitting.edges`).
+own. If one graph does not meet it, two that share a sharp edge are tried, then three that share a corner
+(`surfaces.fitting.edges`).
 
 Source: Ohtake, Belyaev & Alexa, Sparse low-degree implicit surfaces with applications to high quality rendering,
 feature extraction, and smoothing, 2005, whose balls minimise an error instead.
@@ -23,7 +24,16 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.reference.slim import weight
-from filterlab.surfaces.fitting.edges import by_normals, edges_in, ends_in, highest, none
+from filterlab.surfaces.fitting.edges import (
+    EDGES,
+    by_normals,
+    by_three_normals,
+    corners_in,
+    edges_in,
+    ends_in,
+    highest,
+    none,
+)
 from filterlab.surfaces.fitting.graphs import Graphs, Pairs, fitted, summed, unit
 from filterlab.surfaces.fitting.scans import Progress, Scan, tree_of
 
@@ -40,6 +50,7 @@ _ROOM = 1.1  # times the distance of the farthest of the fewest points
 _FIRST = 60  # points, about, by which balls are tried at first
 _DOUBTFUL = 1.3  # times the tolerance, by them
 _LOOSE = 48  # points, from which on a ball may not reach across what was not scanned
+_SLACK = 0.5  # spacings beyond a plane that a point at an edge of its side may be
 _AWAY = -0.5  # n·m of normals on both sides of an edge, at least
 
 
@@ -67,7 +78,7 @@ class Cover:
         weight, off: (N,) sums of weights, and of weights times distances.
         graphs, cuts: of the balls that were kept, part by part.
         counts, members: how many points each graph was fitted to, (m,), and their numbers, graph after graph.
-        sharp, smallest: numbers of balls that share an edge, and of those kept whatever their misfit.
+        sharp, smallest: numbers of balls that share an edge or corner, and of those kept whatever their misfit.
     """
 
     scan: Scan
@@ -133,9 +144,10 @@ class Cover:
         tried = _tried(self.scan, numbers, radii, pairs, self.tolerance, self.order)
         unmet = last & ~tried.good & ~tried.sharp
         self._keep(tried.single, tried.good | unmet)
-        if tried.double is not None:
-            self._keep(tried.double, tried.halves)
-        self.sharp, self.smallest = self.sharp + 2 * int(tried.sharp.sum()), self.smallest + int(unmet.sum())
+        for fits, own in tried.shared:
+            self._keep(fits, own)
+            self.sharp += int(own.sum())
+        self.smallest += int(unmet.sum())
         kept = tried.good | tried.sharp | last
         self.weight[numbers[kept]] = self.weight[numbers[kept]].clamp_min(ENOUGH)  # whatever its normal
         return kept
@@ -156,36 +168,48 @@ class Tried(NamedTuple):
 
     Attributes:
         single: a graph for each. good: (M,) whether it meets the tolerance.
-        double: two graphs for some of the others; None: there are no others. halves: which of them are good.
-        sharp: (M,) whose two graphs are.
+        shared: two graphs for some of the others, three for some of the rest, and which of them are good.
+        sharp: (M,) whose graphs these are.
     """
 
     single: Fits
     good: Tensor
-    double: Fits | None
-    halves: Tensor
+    shared: list[tuple[Fits, Tensor]]
     sharp: Tensor
 
 
 def _tried(scan: Scan, numbers: Tensor, radii: Tensor, pairs: Pairs, tolerance: float, order: int) -> Tried:
-    """One graph in each ball around points; two where that does not meet the tolerance."""
-    centers = scan.points[numbers]
+    """One graph in each ball around points; two or three where that does not meet the tolerance."""
+    centers, spacing = scan.points[numbers], scan.spacing[numbers]
     own, mean = _facing(scan, numbers, pairs, 0.0)
     graphs = fitted(scan.points, own, centers, radii, mean, order)
-    single, good = _judged(scan, scan.spacing[numbers], graphs, own, tolerance, None)
-    sharp, rest = torch.zeros_like(good), ~good
+    single, good = _judged(scan, spacing, graphs, own, tolerance, None)
+    tried = Tried(single, good, [], torch.zeros_like(good))
     own, _ = _facing(scan, numbers, pairs, _AWAY)
-    own = own.of(rest)
-    side, bent = by_normals(scan.normals, own, int(rest.sum()))
-    if not bool(bent.any()):
-        return Tried(single, good, None, sharp, sharp)
-    side, own = side[bent[own.ball]], own.of(bent)
-    rest = rest.nonzero()[:, 0][bent]
-    edges = edges_in(scan.points, scan.normals, own, side, centers[rest], radii[rest], order)
-    spacing = scan.spacing[numbers[rest]].repeat_interleave(2)
-    double, met = _judged(scan, spacing, edges.graphs, edges.pairs, tolerance, edges.cuts)
-    sharp[rest] = edges.valid & met.reshape(-1, 2).all(1)
-    return Tried(single, good, double, sharp[rest].repeat_interleave(2), sharp)
+    for each in (2, 3):
+        rest = (~good & ~tried.sharp).nonzero()[:, 0]
+        some = own.of(_mask(rest, len(good)))
+        side, bent = (by_normals if each == 2 else by_three_normals)(scan.normals, some, len(rest))
+        rest, some, side = rest[bent], some.of(bent), side[bent[some.ball]]
+        if not len(rest):
+            continue
+        given = scan.points, scan.normals, some
+        found = (
+            edges_in(*given, side, centers[rest], radii[rest], order)
+            if each == 2
+            else corners_in(*given, side, _SLACK * spacing[rest], centers[rest], radii[rest], order)
+        )
+        fits, met = _judged(
+            scan, spacing[rest].repeat_interleave(each), found.graphs, found.pairs, tolerance, found.cuts
+        )
+        met = found.valid & met.reshape(-1, each).all(1)
+        tried.sharp[rest] = met
+        tried.shared.append((fits, met.repeat_interleave(each)))
+    return tried
+
+
+def _mask(numbers: Tensor, count: int) -> Tensor:
+    return torch.zeros(count, dtype=torch.bool).index_fill(0, numbers, True)
 
 
 def _judged(
@@ -199,8 +223,10 @@ def _judged(
     met &= highest(off.abs(), pairs.ball, count) <= _WORST * tolerance
     planes, loose = ends_in(scan.points, scan.ends, spacing, graphs, pairs)
     met &= (loose == 0) | (sums[:, 2] < _LOOSE)
-    edge = none(planes).expand(count, 1, 4) if cuts is None else cuts
-    return Fits(graphs, pairs, off, torch.cat((planes, edge), 1)), met
+    edges = none(planes).expand(count, EDGES, 4).clone()
+    if cuts is not None:
+        edges[:, : cuts.shape[1]] = cuts
+    return Fits(graphs, pairs, off, torch.cat((planes, edges), 1)), met
 
 
 def _facing(scan: Scan, numbers: Tensor, pairs: Pairs, least: float) -> tuple[Pairs, Tensor]:

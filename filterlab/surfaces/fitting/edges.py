@@ -1,4 +1,4 @@
-"""Where a ball of a cover ends: at sharp edges, which two graphs share, and at the ends of what was scanned.
+"""Where a ball of a cover ends: at sharp edges and corners, which two or three graphs share, and where the scan ends.
 
 At an edge, y₀ is the point near the centre on both graphs, F₁ = F₂ = 0, and n₁, n₂ are their normals there. The plane
 
@@ -22,7 +22,9 @@ from filterlab.ops.reference.slim import weight
 from filterlab.surfaces.fitting.graphs import Graphs, Pairs, fitted, summed, unit
 
 CUTS = 4
-"""Planes at the ends of what was scanned; one more is at an edge."""
+"""Planes at the ends of what was scanned."""
+EDGES = 2
+"""More of them, at edges: one, or two where three sides meet."""
 _DIRECTIONS = 8
 _NEAR = 1.0  # spacings from a plane is what it explains
 _SHARP = 0.77  # n₁·n₂ at most: 40°
@@ -32,6 +34,8 @@ _FEW_BETWEEN = 0.25  # of them are, at most: a third are where a surface bends e
 _ROUNDS = 3  # of fitting and dividing points by the plane
 _STEPS = 4  # of Newton's method
 _EACH = 6  # points, at least
+_FEWEST = 4  # of a side of a corner
+_AGREE = 0.9  # of their number, that their normals add up to at least
 
 
 class Edges(NamedTuple):
@@ -55,7 +59,7 @@ def edges_in(
     count = len(centers)
     own = pairs._replace(ball=2 * pairs.ball + side)
     for turn in range(_ROUNDS):
-        graphs = _halves(points, normals, own, centers, radii, order)
+        graphs = _shared(points, normals, own, centers, radii, order, 2)
         place, both = _edge(graphs)
         across = unit(both[:, 0] - both[:, 1])
         y = (points[pairs.point] - centers[pairs.ball]) / radii[pairs.ball, None]
@@ -70,12 +74,80 @@ def edges_in(
     return Edges(graphs, own, torch.stack((plane, -plane), 1).reshape(-1, 1, 4), valid)
 
 
-def _halves(points: Tensor, normals: Tensor, pairs: Pairs, centers: Tensor, radii: Tensor, order: int) -> Graphs:
-    """Two graphs around each centre; one without points is level."""
+def corners_in(
+    points: Tensor,
+    normals: Tensor,
+    pairs: Pairs,
+    side: Tensor,
+    slack: Tensor,
+    centers: Tensor,
+    radii: Tensor,
+    order: int,
+) -> Edges:
+    """Three graphs in every ball, 3 i … 3 i + 2, with two planes each, which are found from sides (P,), 0, 1 or 2.
+
+    Each is kept on its own side of the planes through its edges, as at an edge: so corners are convex or concave, and
+    others, where one side lies around the other two, are not valid. Points are divided by which graph is nearest; of
+    those further than a slack (M,) on the wrong side of a plane there must be none.
+    """
+    count, own = len(centers), pairs._replace(ball=3 * pairs.ball + side)
+    for turn in range(_ROUNDS):
+        graphs = _shared(points, normals, own, centers, radii, order, 3)
+        if turn < _ROUNDS - 1:
+            off = [graphs.distances(points[pairs.point], 3 * pairs.ball + k).abs() for k in range(3)]
+            own = own._replace(ball=3 * pairs.ball + torch.stack(off).argmin(0))
+    cuts = centers.new_zeros(count, 3, 2, 4)
+    valid = torch.bincount(own.ball, minlength=3 * count).reshape(-1, 3).amin(1) >= _FEWEST
+    y, side = (points[pairs.point] - centers[pairs.ball]) / radii[pairs.ball, None], own.ball % 3
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        place, both = _edge(graphs[(3 * torch.arange(count)[:, None] + torch.tensor([i, j])).flatten()])
+        across = unit(both[:, 0] - both[:, 1])
+        height = (across[pairs.ball] * (y - place[pairs.ball])).sum(-1)
+        shared = own.where((side == i) | (side == j))
+        part = 2 * torch.div(shared.ball, 3, rounding_mode="floor") + (shared.ball % 3 == j).long()
+        turned = _turned(height[(side == i) | (side == j)], part, count)
+        beyond = torch.where(side == i, -1.0, torch.where(side == j, 1.0, 0.0)) * height * turned[pairs.ball]
+        plane = turned[:, None] * torch.cat((-across, (across * place).sum(-1, keepdim=True)), 1)
+        cuts[:, i, 0], cuts[:, j, 1] = plane, -plane
+        valid &= ((both[:, 0] * both[:, 1]).sum(-1) < _SHARP) & (place.norm(dim=-1) < 1)
+        valid &= highest(beyond, pairs.ball, count) <= slack / radii
+    return Edges(graphs, own, cuts.flatten(0, 1), valid)
+
+
+def by_three_normals(normals: Tensor, pairs: Pairs, count: int) -> tuple[Tensor, Tensor]:
+    """Which (P,) of three normals far from each other that of a point is nearest to; (M,) whether all agree.
+
+    Agree: those of a side, added up, are nearly as long as they are many. Where a surface bends evenly, or normals are
+    noise, they are not.
+    """
+    own = normals[pairs.point]
+    mean = unit(summed(own, pairs.ball, count))
+    chosen = [own[_farthest(1 - (own * mean[pairs.ball]).sum(-1), pairs.ball, count)]]
+    apart = 1 - (own * chosen[0][pairs.ball]).sum(-1)
+    for _ in range(2):
+        chosen.append(own[_farthest(apart, pairs.ball, count)])
+        apart = torch.minimum(apart, 1 - (own * chosen[-1][pairs.ball]).sum(-1))
+    side = torch.stack([(own * normal[pairs.ball]).sum(-1) for normal in chosen]).argmax(0)
+    sums = summed(torch.cat((own, torch.ones_like(own[:, :1])), 1), 3 * pairs.ball + side, 3 * count)
+    agree = (sums[:, :3].norm(dim=1) >= _AGREE * sums[:, 3]) & (sums[:, 3] >= _FEWEST)
+    pairwise = [(chosen[k - 1] * chosen[k]).sum(-1) for k in range(3)]
+    return side, agree.reshape(-1, 3).all(1) & (torch.stack(pairwise).amax(0) < _SHARP)
+
+
+def _farthest(apart: Tensor, ball: Tensor, count: int) -> Tensor:
+    """The number (M,) of a pair of each ball in which this is largest."""
+    place = torch.where(apart >= highest(apart, ball, count)[ball], torch.arange(len(apart)), 0)
+    return place.new_zeros(count).scatter_reduce(0, ball, place, "amax")
+
+
+def _shared(
+    points: Tensor, normals: Tensor, pairs: Pairs, centers: Tensor, radii: Tensor, order: int, each: int
+) -> Graphs:
+    """So many graphs around each centre; one without points is level."""
     rows = weight(pairs.square)[:, None] * normals[pairs.point]
-    mean = unit(summed(rows, pairs.ball, 2 * len(centers)))
+    mean = unit(summed(rows, pairs.ball, each * len(centers)))
     mean[(mean == 0).all(1)] = mean.new_tensor([0.0, 0.0, 1.0])
-    return fitted(points, pairs, centers.repeat_interleave(2, 0), radii.repeat_interleave(2), mean, order)
+    return fitted(points, pairs, centers.repeat_interleave(each, 0), radii.repeat_interleave(each), mean, order)
 
 
 def ends_in(points: Tensor, ends: Tensor, spacing: Tensor, graphs: Graphs, pairs: Pairs) -> tuple[Tensor, Tensor]:

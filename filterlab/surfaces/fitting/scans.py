@@ -26,6 +26,7 @@ _ALONG = 2  # of them that are at an end too
 _APART = 5.0  # spacings of its neighbours: further from them is a stray
 _OFF = 10.0  # times as far from the graph of its neighbours as most of them are from theirs
 _MOST = 0.75  # of them
+_BETTER = 0.25  # of the misfit of its own graph, that of another one whose normal a point takes
 _FEWEST = 400  # points in a tree
 _AT_ONCE = 1 << 15  # pairs of balls and points: what is computed of them stays in a cache
 _HALF_OCTAVE = 2**0.5
@@ -123,6 +124,7 @@ def scan_of(points: Tensor, normals: Tensor | None, seed: int, progress: Progres
     else:
         given = unit(normals[kept])
         own = torch.where(((own * given).sum(-1) < 0)[:, None], -own, own)
+    own = _sharpened(points[kept], own, near, graphs)
     ends = _ends(graphs.frames, points[kept], near)
     spacing = far[:, _NEAREST] * (np.pi / (_NEAREST + 1)) ** 0.5
     return Scan(points[kept][on], own[on], spacing[on], ends[on], seed), kept[on]
@@ -181,6 +183,34 @@ def _on_surface(points: Tensor, near: Tensor, graphs: Graphs) -> Tensor:
     off = graphs.distances(points, torch.arange(len(points))).abs()
     usual = off[near[:, 1:]].quantile(_MOST, dim=1)
     return off <= _OFF * usual + 1e-12
+
+
+def _sharpened(points: Tensor, normals: Tensor, near: Tensor, graphs: Graphs) -> Tensor:
+    """Normals (N, 3) at sharp edges, which neighbours on both sides blur: of the graph of a neighbour on one side.
+
+    A graph is as bad for a point as its own points are far from it, or as this one is; another one is taken where it is
+    much better than that of the point itself. Elsewhere normals stay.
+    """
+    near, found = near[:, : NEIGHBORS + 1], normals.clone()
+    parts = torch.arange(len(points)).split(_AT_ONCE // NEIGHBORS)
+    spread = torch.cat([_off(points, graphs, near[some], some[:, None]).square().mean(1).sqrt() for some in parts])
+    for some in parts:
+        bad = torch.maximum(spread[near[some]], _off(points, graphs, some[:, None], near[some]).abs())
+        least, k = bad.min(1)
+        better = least < _BETTER * bad[:, 0]
+        own, ball = some[better], near[some, k][better]
+        _, gradient = graphs.jet(graphs.local(points[own], ball), ball)
+        frames = graphs.frames[ball]
+        normal = unit((gradient[:, :, None] * frames).sum(1))
+        side = (frames[:, 2] * normals[ball]).sum(-1, keepdim=True)
+        found[own] = torch.where(side < 0, -normal, normal)
+    return found
+
+
+def _off(points: Tensor, graphs: Graphs, point: Tensor, ball: Tensor) -> Tensor:
+    """Distances (m, k) of points from graphs, by numbers of both that broadcast to it."""
+    point, ball = torch.broadcast_tensors(point, ball)
+    return graphs.distances(points[point.flatten()], ball.flatten()).reshape(ball.shape)
 
 
 def _ends(frames: Tensor, points: Tensor, near: Tensor) -> Tensor:
