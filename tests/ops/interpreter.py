@@ -1,8 +1,8 @@
 """Triton's interpreter without what it does anew for each of some hundred thousand small operations.
 
 Types of blocks and all that follows from them are kept, blocks of one shape are not compared entry by entry, and the
-sums in 64 bits that an overflow would show in are left out, as nothing asks for them (`device_assert` does nothing there
-without `debug`). What is computed stays what it was, at half of the time.
+sums in 64 bits that an overflow would show in are left out: `device_assert` does nothing there without `debug`. What is
+computed stays what it was, at half of the time.
 """
 
 from __future__ import annotations
