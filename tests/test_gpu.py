@@ -8,15 +8,17 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="the package triton is not installed")
 
+from experiments.covers import torus
 from filterlab import reconstruct, resample
 from filterlab.methods import METHODS
 from filterlab.ops.differentiable.prefilter import implementation_for, prefilter_samples
 from filterlab.prefilters import PREFILTERS
 from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction, render
 from filterlab.roots import all_roots, first_root
-from filterlab.surfaces import LevelSet, Quadrics
+from filterlab.surfaces import HeightField, LevelSet, Quadrics, Slim, Surface
+from filterlab.surfaces.quartic import SPLINES as QUARTIC
 from filterlab.volume import Boundary, Volume
-from tests.test_methods import TENSOR_PRODUCTS
+from tests.test_methods import CONTINUOUS
 from tests.tetrahedral_oracle import SPLINES
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU that torch can use")
@@ -110,7 +112,8 @@ def _image(device: str, method: str, scheme: str | None, dtype: torch.dtype) -> 
     x = samples(dtype)[0, 0].to(device).requires_grad_()
     options = {} if scheme is None else {"scheme": scheme}
     field = reconstruct(Volume(x, spacing=(0.5, 1.0, 0.8)), method, **options)
-    camera = PerspectiveCamera.framing(field.domain, (0.4, 0.8, -0.45))
+    # gradients of qss jump at x = y and the like, in voxels, where rounding must not decide
+    camera = PerspectiveCamera.framing(field.domain, (0.37, 0.81, -0.46))
     opacities = torch.tensor([0.01, 0.3, 0.1], dtype=dtype, device=device, requires_grad=True)
     colors = [[0.2, 0.3, 0.9], [0.8, 0.5, 0.1], [0.4, 0.9, 0.3]]
     transfer = TransferFunction([0.1, 0.4, 0.9], colors, opacities, unit=0.2)
@@ -163,7 +166,7 @@ def _hits(device: str, method: str, dtype: torch.dtype) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
-@pytest.mark.parametrize("method", [*TENSOR_PRODUCTS, *SPLINES])
+@pytest.mark.parametrize("method", [*CONTINUOUS, *SPLINES])
 def test_hits_and_their_derivatives(method: str, dtype: torch.dtype) -> None:
     """A ray or two of float32 may graze the level, and pass on one device."""
     expected, found = _hits("cpu", method, dtype), _hits("cuda", method, dtype)
@@ -181,7 +184,7 @@ def test_hits_and_their_derivatives(method: str, dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
 def test_quadrics(dtype: torch.dtype) -> None:
-    """In plain torch, where it is not the CPU."""
+    """Hits, in order, and derivatives to centres."""
     rng = torch.Generator().manual_seed(2)
     centers, radii = 5 * torch.rand(300, 3, generator=rng).double(), 0.1 + 0.4 * torch.rand(300, generator=rng).double()
     origins, ends = (8 * torch.rand(2, 2000, 3, generator=rng).double() - 1.5).to(dtype)
@@ -198,4 +201,66 @@ def test_quadrics(dtype: torch.dtype) -> None:
     (piece, t, gradient), on_gpu = found
     assert torch.equal(on_gpu[0].cpu(), piece)
     assert_same(on_gpu[1], t)
-    assert_same(on_gpu[2], gradient)
+    limit = TOLERANCE[dtype] * float(gradient.abs().max())  # t is rounded to it
+    torch.testing.assert_close(on_gpu[2].cpu(), gradient, rtol=0, atol=limit)
+
+
+def _of_surface(surface: Surface, x: Tensor, origins: Tensor, directions: Tensor) -> dict[str, Tensor]:
+    """First hits, what is known of them, all sheets, and derivatives to what the surface is made of and to rays."""
+    o = origins.clone().requires_grad_()
+    hit = surface.hit(o, directions)
+    at = surface.at(o, directions, hit)
+    steep = hit.valid & ((at.normal * directions).sum(-1).abs() > 0.2 * directions.norm(dim=-1))
+    depth, normal = torch.where(steep, hit.t, 0), torch.where(steep[:, None], at.normal, 0)
+    to_numbers, to_origins = torch.autograd.grad(depth.square().sum() + normal.sin().sum(), (x, o))
+    sheets = surface.hits(origins, directions, 3)
+    assert int(steep.sum()) > 300
+    return {
+        "t": depth,
+        "normal": normal,
+        "sheets": torch.where(sheets.valid, sheets.t, -1.0),
+        "met": surface.met(origins, directions).double(),
+        "numbers": to_numbers,
+        "origins": to_origins,
+    }
+
+
+def _assert_all_same(on_cpu: dict[str, Tensor], on_gpu: dict[str, Tensor], limit: float) -> None:
+    for name, x in on_cpu.items():
+        most = limit * float(x.detach().abs().max())
+        torch.testing.assert_close(on_gpu[name].cpu(), x, rtol=0, atol=most, msg=lambda t, name=name: f"{name}: {t}")
+
+
+@pytest.mark.parametrize("spline", QUARTIC)
+def test_terrains(spline: str) -> None:
+    rng = torch.Generator().manual_seed(8)
+    heights = torch.rand(150, 200, generator=rng, dtype=torch.float64) * 3
+    origins, ends = torch.rand(2, 4000, 3, generator=rng, dtype=torch.float64) * torch.tensor([220.0, 170.0, 30.0])
+    ends[:, 2] *= 0.03
+    points = torch.rand(3000, 2, generator=rng, dtype=torch.float64) * 220 - 10
+    results = []
+    for device in ("cpu", "cuda"):
+        x = heights.to(device).requires_grad_()
+        surface = HeightField(x, spline)
+        jet = surface.jet(points.to(device), 2)
+        found = _of_surface(surface, x, origins.to(device), (ends - origins).to(device))
+        found |= {f"jet {k}": part for k, part in enumerate(jet)}
+        (found["splat"],) = torch.autograd.grad(sum(part.square().sum() for part in jet), x)
+        found["viewshed"] = surface.viewshed((70.0, 60.0), 2.0).double()
+        results.append(found)
+    _assert_all_same(*results, 1e-9)
+
+
+@pytest.mark.parametrize("faces", ["front", "both"])
+def test_covers(faces: str) -> None:
+    rng = torch.Generator().manual_seed(9)
+    centers, *rest = torus(1500)
+    low, high = centers.amin(0), centers.amax(0)
+    origins, ends = torch.rand(2, 4000, 3, generator=rng, dtype=torch.float64) * (high - low).double() + low.double()
+    origins = origins + 3 * (origins - (low + high) / 2)
+    results = []
+    for device in ("cpu", "cuda"):
+        c = centers.to(device).requires_grad_()
+        surface = Slim(c, *(x.to(device) for x in rest), faces=faces)
+        results.append(_of_surface(surface, c, origins.to(device), (ends - origins).to(device)))
+    _assert_all_same(*results, 1e-8)

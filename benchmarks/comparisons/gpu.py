@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from benchmarks import workloads
-from benchmarks.comparisons import surfaces
+from benchmarks.comparisons import slim, surfaces, terrain
 from benchmarks.harness import Comparison, Contestant, Item, Race, Ratio, race_item
 from benchmarks.level_sets import hits_and_normals, surface_of, task_of
 from benchmarks.peers import cupy_march, cupy_ndimage, cupy_texture
@@ -25,12 +25,17 @@ from benchmarks.settings import Settings
 from filterlab import ops
 from filterlab.kernels import bspline
 from filterlab.methods import METHODS, Tetrahedral, reconstruct
+from filterlab.names import SPLINES
+from filterlab.ops.differentiable import height_hits, heights
+from filterlab.ops.differentiable import slim as sheets
 from filterlab.ops.differentiable.prefilter import prefilter_samples
 from filterlab.roots import first_root
+from filterlab.surfaces import Slim
 
 _POINTS = 16  # times as many as elsewhere
 _IMAGE = 4  # times the edge
 _TETRAHEDRAL = tuple(name for name, method in METHODS.items() if isinstance(method, Tetrahedral))
+_WAYS = {"fused": "cuda", "direct": "reference"}
 _FLOATS = 3 + 4  # of a point and of its rows
 
 
@@ -264,6 +269,106 @@ def _hits_adjoint(settings: Settings) -> Race:
     return Race(what, contestants, [Ratio("both ways", "forward")])
 
 
+# --- terrains and covers ----------------------------------------------------------------------------------------------
+
+
+def _moved(rays: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    origins, directions = (x.reshape(-1, 3).cuda() for x in rays)
+    return origins, directions
+
+
+def _finite(*numbers: Tensor) -> tuple[Tensor, ...]:
+    return tuple(x.nan_to_num(posinf=0) for x in numbers)
+
+
+def _heights(settings: Settings, arrangement: str) -> Race:
+    """Heights and slopes of one terrain. Also a copy of as many bytes as points and rows have."""
+    jet, points = _of_ground(settings, arrangement, _POINTS * settings.points)
+    count = points.shape[1]
+    block = points.new_empty(5 * count // 2)
+    contestants = [
+        _finished("fused", partial(jet, "cuda"), None, count),
+        _finished("copy", lambda: (block.clone(),), None, count),
+    ]
+    return Race(f"c1 height + slope, {count:,} points, {arrangement}", contestants, [Ratio("fused", "copy")])
+
+
+def _heights_direct(settings: Settings) -> Race:
+    jet, points = _of_ground(settings, "random", settings.points // 4)
+    count = points.shape[1]
+    contestants = [_finished(name, partial(jet, how), "heights and slopes", count) for name, how in _WAYS.items()]
+    return Race(f"c1 height + slope, {count:,} points", contestants, [Ratio("fused", "direct")], tolerance=1e-4)
+
+
+def _of_ground(settings: Settings, arrangement: str, count: int) -> tuple[Callable[[str], tuple[Tensor]], Tensor]:
+    """What gives the jets of a terrain by an implementation, and where."""
+    grid = terrain.ground(terrain.hills(terrain.size_of(settings)).cuda(), "c1").cast.heights
+    points = workloads.points(arrangement, settings.voxels, count)[None, :, :2].cuda() / settings.voxels
+    return lambda implementation: (heights.jet(grid, points, 1, implementation)[0],), points
+
+
+def _terrain(settings: Settings) -> Race:
+    """First hits by every spline, and of c1 the program alone."""
+    data, rays = terrain.hills(terrain.size_of(settings)).cuda(), _moved(terrain.view(_IMAGE * settings.image))
+    grounds = {spline: terrain.ground(data, spline) for spline in SPLINES}
+    count = len(rays[0])
+    contestants = [
+        _finished(name, partial(hits_and_normals, surface, *rays), None, count) for name, surface in grounds.items()
+    ]
+    cast = grounds["c1"].cast
+    contestants.append(_finished("program", lambda: (height_hits.first(cast, *rays),), None, count))
+    what = f"{len(data)}² data, {count:,} float32 rays: first hits and normals; c1 hits alone: program"
+    return Race(what, contestants, [Ratio("c1", "linear"), Ratio("c1", "program")])
+
+
+def _terrain_direct(settings: Settings) -> Race:
+    data, rays = terrain.hills(terrain.size_of(settings) // 2).cuda(), _moved(terrain.view(settings.image // 4))
+    cast = terrain.ground(data, "c1").cast
+    by = lambda how: lambda: _finite(height_hits.first(cast, *rays, how))  # noqa: E731
+    contestants = [
+        _finished(n, by(how), "hits", len(rays[0])) for n, how in (("fused", "cuda"), ("direct", "reference"))
+    ]
+    what = f"{len(data)}² data, {len(rays[0]):,} rays: first hits of c1"
+    return Race(what, contestants, [Ratio("fused", "direct")], tolerance=1e-6)
+
+
+def _cover(settings: Settings, balls: int) -> Slim:
+    cover = slim.cover_of(settings, balls)
+    return cover.with_tensors([x.cuda() for x in cover.tensors])
+
+
+def _slim(settings: Settings) -> Race:
+    """First hits and normals of covers of a torus, a fifth of the rays hit."""
+    covers = {f"{n:,} balls": _cover(settings, n) for n in (5_000, 180_000)}
+    rays = _moved(slim.rays_of(slim.cover_of(settings, 5_000), _IMAGE * settings.image))
+    contestants = [
+        _finished(name, partial(hits_and_normals, cover, *rays), None, len(rays[0])) for name, cover in covers.items()
+    ]
+    few, many = covers
+    (given,) = covers[few].described
+    contestants.append(_finished("program", lambda: tuple(sheets.sheets(given, *rays, 1)), None, len(rays[0])))
+    what = f"a torus, {len(rays[0]):,} float32 rays: first hits and normals; hits of {few} alone: program"
+    return Race(what, contestants, [Ratio(many, few), Ratio(few, "program")])
+
+
+def _slim_direct(settings: Settings) -> Race:
+    (given,) = _cover(settings, 5_000).described
+    rays = _moved(slim.rays_of(slim.cover_of(settings, 5_000), settings.image // 4))
+
+    def by(how: str) -> Callable[[], Any]:
+        def call() -> tuple[Tensor, ...]:
+            found = sheets.sheets(given, *rays, 1, implementation=how)
+            return _finite(found.t, found.normal)
+
+        return call
+
+    contestants = [
+        _finished(n, by(how), "hits", len(rays[0])) for n, how in (("fused", "cuda"), ("direct", "reference"))
+    ]
+    what = f"a torus in 5,000 balls, {len(rays[0]):,} rays: first sheets"
+    return Race(what, contestants, [Ratio("fused", "direct")], tolerance=1e-6)
+
+
 # --- roots ------------------------------------------------------------------------------------------------------------
 
 
@@ -293,6 +398,12 @@ _ITEMS: dict[str, tuple[float, Callable[[Settings], Race]]] = {
     "hits": (5, _hits),
     "hits-direct": (20, _hits_direct),
     "hits-adjoint": (5, _hits_adjoint),
+    **{f"heights-{a}": (5, partial(_heights, arrangement=a)) for a in workloads.ARRANGEMENTS},
+    "heights-direct": (20, _heights_direct),
+    "terrain": (5, _terrain),
+    "terrain-direct": (20, _terrain_direct),
+    "slim": (5, _slim),
+    "slim-direct": (20, _slim_direct),
     "roots-float32": (10, partial(_roots, dtype=torch.float32)),
     "roots-float64": (10, partial(_roots, dtype=torch.float64)),
 }

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 from torch import Tensor
 
-from filterlab.ops import cpu
+from filterlab.ops import cpu, cuda
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.gather import STORAGE
@@ -17,14 +19,14 @@ _FEWEST = 1 << 14
 
 
 def missing(heights: Heights) -> str | None:
-    """What keeps the programs from running here; None: nothing does."""
+    """What keeps the programs from running where the heights are; None: nothing does."""
     if transforming():
         return "it has no transforms of torch.func"
-    if problem := cpu.llvmlite_problem():
-        return problem
     values = heights.values
-    if values.device.type != "cpu" or values.dtype not in STORAGE:
-        return f"it reads {', '.join(STORAGE.values())} on the CPU; got {values.dtype} on {values.device}"
+    if problem := cuda.device_problem(values) if values.device.type == "cuda" else cpu.llvmlite_problem():
+        return problem
+    if values.device.type not in ("cpu", "cuda") or values.dtype not in STORAGE:
+        return f"it reads {', '.join(STORAGE.values())} on the CPU or a GPU; got {values.dtype} on {values.device}"
     return None
 
 
@@ -32,11 +34,11 @@ def described(heights: Heights, implementation: str | None = None) -> HeightHits
     """What is cast, of one grid: with bounds of all blocks, which are found here.
 
     Args:
-        implementation: "reference", "cpu" or "cuda"; None: the faster one of the first two that can run.
+        implementation: "reference", "cpu" or "cuda"; None: the fastest that can run.
     """
     cell, (columns, rows) = Cell.of(heights.pattern), heights.cells
     if implementation is None:
-        implementation = "cpu" if columns * rows >= _FEWEST and missing(heights) is None else "reference"
+        implementation = _implementation_for(heights) if columns * rows >= _FEWEST else "reference"
     return HeightHits(heights, cell, driver(implementation, "height_hits").pyramid(heights, cell))
 
 
@@ -44,8 +46,7 @@ def first(given: HeightHits, origins: Tensor, directions: Tensor, implementation
     """t (R,) float64, where rays (R, 3) first meet the surface; ∞ where they don't. Without derivatives.
 
     Args:
-        implementation: "reference", "cpu" or "cuda", which has only run in the interpreter yet; None: the faster one of
-            the first two that can run.
+        implementation: "reference", "cpu" or "cuda"; None: the fastest that can run.
     """
     return _driver(given, origins, implementation).first(given, origins, directions)
 
@@ -60,8 +61,14 @@ def candidates(given: HeightHits, origins: Tensor, directions: Tensor, implement
     return _driver(given, origins, implementation).candidates(given, origins, directions)
 
 
-def _driver(given: HeightHits, origins: Tensor, implementation: str | None):
+def _driver(given: HeightHits, origins: Tensor, implementation: str | None) -> ModuleType:
     if implementation is None:
-        here = origins.device.type == "cpu" and missing(given.heights) is None
-        implementation = "cpu" if here else "reference"
+        together = given.heights.values.device == origins.device
+        implementation = _implementation_for(given.heights) if together else "reference"
     return driver(implementation, "height_hits")
+
+
+def _implementation_for(heights: Heights) -> str:
+    """What casts rays at these unasked: "cpu" (vector code), or "cuda" (Triton) on a GPU; else plain torch."""
+    fused = "cuda" if heights.values.device.type == "cuda" else "cpu"
+    return fused if missing(heights) is None else "reference"

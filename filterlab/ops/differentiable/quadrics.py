@@ -7,21 +7,24 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from filterlab.ops import cpu
+from filterlab.ops import cpu, cuda
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.quadrics import InLeaves
+
+_IN_TRITON = ("quadrics",)
 
 
 def missing(given: InLeaves, origins: Tensor) -> str | None:
     """What keeps the program from running here; None: nothing does."""
     if transforming():
         return "it has no transforms of torch.func"
-    if problem := cpu.llvmlite_problem():
-        return problem
-    if given.leaves.device.type != "cpu" or origins.device.type != "cpu":
-        return f"it works on tensors of the CPU; got {given.leaves.device} and {origins.device}"
-    return None
+    here = given.leaves.device
+    if here != origins.device:
+        return f"it works on tensors of one device; got {here} and {origins.device}"
+    if here.type == "cuda":
+        return cuda.device_problem(origins) if given.op in _IN_TRITON else f"there is none of {given.op} in Triton"
+    return cpu.llvmlite_problem() if here.type == "cpu" else f"it works on tensors of the CPU or a GPU; got {here}"
 
 
 def hits(
@@ -43,5 +46,6 @@ def hits(
 
 
 def implementation_for(given: InLeaves, origins: Tensor) -> str:
-    """What casts these rays unasked: "cpu" on the CPU, else plain torch. "cuda" has only run in the interpreter yet."""
-    return "cpu" if missing(given, origins) is None else "reference"
+    """What casts these rays unasked: "cpu" (vector code), or "cuda" (Triton) on a GPU; else plain torch."""
+    fused = "cuda" if given.leaves.device.type == "cuda" else "cpu"
+    return fused if missing(given, origins) is None else "reference"
