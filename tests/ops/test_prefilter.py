@@ -279,7 +279,7 @@ def test_derivatives_of_first_and_second_order(name: str, tail: int, boundary: B
         return prefilter_samples(x, name, boundary, tail, "cpu") ** 2
 
     assert torch.autograd.gradcheck(squared, (x,), check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(squared, (x,))
+    assert torch.autograd.gradgradcheck(squared, (x,), fast_mode=tail > 0)
 
 
 @every_boundary
