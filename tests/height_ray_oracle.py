@@ -253,7 +253,8 @@ def _rows(parts: _Parts, line, low, high, close: float, rays: int) -> tuple[np.n
 
 def _slope(c: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Of polynomials (Q, 5) at x (Q,)."""
-    return _N * sum(comb(3, i) * own * x**i * (1 - x) ** (3 - i) for i, own in enumerate(np.diff(c, axis=1).T))
+    terms = [comb(3, i) * own * x**i * (1 - x) ** (3 - i) for i, own in enumerate(np.diff(c, axis=1).T)]
+    return _N * np.sum(terms, 0)
 
 
 def _bisected(c: np.ndarray, sign: np.ndarray) -> np.ndarray:

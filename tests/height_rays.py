@@ -278,6 +278,7 @@ def campaign(seconds: float, rays: int = 16000, first: int = 0, every: int = 40)
 
 
 if __name__ == "__main__":
-    verdicts = campaign(*map(float, sys.argv[1:2]), *map(int, sys.argv[2:5]))
+    numbers = map(int, sys.argv[2:5])
+    verdicts = campaign(float(sys.argv[1]), *numbers)
     for (spline, kind), verdict in (verdicts | {("all", ""): sum(verdicts.values(), Counter())}).items():
         print(f"{spline:17}{kind:24}", *(f"{key} {verdict[key]}" for key in ("rays", "undecided", "hits", *FAULTS)))

@@ -61,8 +61,9 @@ def mask(spline: str, alpha: tuple[int, ...]) -> dict[tuple[int, int], float]:
     m = STEPS[spline]
     corners = np.array([(0, 0), (m, 0), (0, m)])
     if spline == "linear":
-        return {tuple(map(int, c)): a / 4 for c, a in zip(corners, alpha, strict=True) if a}
-    kind = {(4, 0): "v", (3, 1): "u", (2, 2): "e", (2, 1): "z"}[tuple(sorted(alpha, reverse=True)[:2])]
+        return {(int(x), int(y)): a / 4 for (x, y), a in zip(corners, alpha, strict=True) if a}
+    largest, next_ = sorted(alpha, reverse=True)[:2]
+    kind = {(4, 0): "v", (3, 1): "u", (2, 2): "e", (2, 1): "z"}[largest, next_]
     order = next(p for p in permutations(range(3)) if [alpha[k] for k in p] == sorted(alpha, reverse=True))
     first, second, third = corners[list(order)]
     along, across = (second - first) // m, (third - first) // m

@@ -172,6 +172,16 @@ def test_pieces_tell_which_quadric_is_hit():
     torch.testing.assert_close(at.normal[own], outward[own])
 
 
+def test_tensors_of_another_device_take_bounds_with_them():
+    surface = balls()
+    moved = surface.with_tensors([x.to("meta") for x in surface.tensors])
+    bounds = moved.bounds
+    places = (bounds.centers, bounds.radii, bounds.planes, *bounds.boxes, *moved.tensors)
+    assert {x.device.type for x in places} == {"meta"}
+    assert moved.device.type == "meta"
+    assert surface.with_tensors(surface.tensors).bounds is surface.bounds
+
+
 def test_memory_does_not_grow_with_pairs(plain, monkeypatch):
     """A stack of a few pairs at a time finds the same."""
     surface, (origins, directions) = balls(700), rays(300)

@@ -343,6 +343,18 @@ def test_heights_alone_are_shown_as_the_command_does(dem, tmp_path, capsys):
     assert "water: 1100" in told
 
 
+@pytest.mark.parametrize("asked", [["--level", "3"], ["--mip"], ["--frame", "1"]])
+def test_heights_have_no_level_and_are_no_volume(dem, tmp_path, capsys, asked):
+    assert main(["render", str(dem), "-o", str(tmp_path / "b.png"), *asked]) == 1
+    assert f"expected no {asked[0]} of heights, which are a terrain" in capsys.readouterr().err
+
+
+def test_a_file_of_holes_alone_is_told_by_name(tmp_path, capsys):
+    np.save(tmp_path / "holes.npy", np.full((3, 4), np.nan, np.float32))
+    assert main(["terrain", str(tmp_path / "holes.npy"), "-o", str(tmp_path / "b.png")]) == 1
+    assert "holes.npy: expected a height somewhere; all 12 are missing" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("material", ["phong", "toon", "{kind: environment, reflectivity: 1}", "reflection_lines"])
 def test_terrains_have_every_material_and_their_own_colours(dem, material):
     asked = {"terrain.material": material, "size": "[16, 12]", "terrain.subpixels": "1"}

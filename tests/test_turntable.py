@@ -46,6 +46,18 @@ def test_a_camera_goes_round_what_is_up() -> None:
     torch.testing.assert_close(camera.turned(360).position, before + target, rtol=0, atol=1e-12)
 
 
+def test_a_compass_that_looks_straight_down_turns_on_the_spot() -> None:
+    """It was refused, for nothing turns about an axis that is looked along, with that axis above."""
+    scene = loads_config(MEDIUM + "camera: {compass: [30, 90]}\n", Scene)
+    views = [view.camera for view in turntable(build(scene), 4)]
+    for k, camera in enumerate(views):
+        angle = math.radians(30 - 90 * k)  # counter-clockwise from above: azimuths fall
+        above = torch.tensor([math.sin(angle), math.cos(angle), 0.0], dtype=torch.float64)
+        assert torch.allclose(torch.as_tensor(camera.up, dtype=torch.float64), above, atol=1e-12)
+        places = (torch.as_tensor(c.position, dtype=torch.float64) for c in (camera, views[0]))
+        assert torch.allclose(*places, atol=1e-9)
+
+
 def test_a_pose_begins_where_it_is_and_keeps_its_distance() -> None:
     prepared = build(loads_config(MEDIUM + POSE, Scene))
     views = turntable(prepared, 5)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,6 +39,8 @@ def scene_asked_for(
             called = {"slim": "a SLIM surface", "quadrics": "quadrics"}[key]
             raise ValueError(f"expected no --level, --frame and --channel of {called}; got some: {path}")
         scene = alone_scene(path, key, chosen)
+    elif (asked := _of_volumes(level, overrides, part)) and _holds_heights(path):
+        raise ValueError(f"expected no {asked} of heights, which are a terrain and no volume: {path}")
     elif level is not None and path.suffix.lower() in (".yaml", ".yml"):
         raise ValueError(f"expected a volume with --level; got a scene, whose level is --surface.level: {path}")
     elif level is not None:
@@ -60,6 +62,12 @@ def scene_asked_for(
             check_not_input(output, Path(source))
     check_device(scene.device)
     return scene, volume
+
+
+def _of_volumes(level: str | None, overrides: Iterable[str], part: Iterable[str]) -> str:
+    """The options among these that only volumes have; a picture of one page may be looked at as a --slice."""
+    names = ["level"] * (level is not None) + ["mip"] * any(name.partition(".")[0] == "mip" for name in overrides)
+    return ", ".join(f"--{name}" for name in (*names, *part))
 
 
 def _alone(path: Path) -> str | None:

@@ -96,18 +96,20 @@ class Camera(ABC):
         aspect = (width * (bottom - top)) / (height * (right - left))
         return self._rays((2 * u - 1) * aspect, 1 - 2 * v)
 
-    def turned(self, degrees: float) -> Self:
-        """This camera moved round its target about the axis along `up`, counter-clockwise seen from where that points.
+    def turned(self, degrees: float, axis: Vector | None = None) -> Self:
+        """This camera moved round its target about an axis, counter-clockwise seen from where that points.
 
-        position' = target + v cos φ + (k × v) sin φ + k (k·v)(1 − cos φ),   v = position − target, k = up / |up|
+        position' = target + v cos φ + (k × v) sin φ + k (k·v)(1 − cos φ),   v = position − target, k = axis / |axis|
+
+        Args:
+            axis: None: `up`. Another one turns `up` as well.
 
         Source: Rodrigues, Des lois géométriques qui régissent les déplacements d'un système solide, 1840.
         """
         position, target, up = (_vector(v, self.device) for v in (self.position, self.target, self.up))
-        v, k = position - target, _unit(up)
-        sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
-        moved = v * cosine + torch.linalg.cross(k, v) * sine + k * (k * v).sum() * (1 - cosine)
-        return replace(self, position=target + moved)
+        k = _unit(up if axis is None else _vector(axis, self.device))
+        moved = replace(self, position=target + _rotated(position - target, k, degrees))
+        return moved if axis is None else replace(moved, up=_rotated(up, k, degrees))
 
     @abstractmethod
     def _rays(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -362,6 +364,12 @@ def _basis(position: Tensor, target: Tensor, up: Tensor) -> tuple[Tensor, Tensor
         raise ValueError(f"up must not lie along the view; got up {up.tolist()}, view {view.tolist()}")
     right = side / side.norm()
     return right, torch.linalg.cross(right, forward), forward
+
+
+def _rotated(v: Tensor, k: Tensor, degrees: float) -> Tensor:
+    """v about the unit vector k."""
+    sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    return v * cosine + torch.linalg.cross(k, v) * sine + k * (k * v).sum() * (1 - cosine)
 
 
 def _unit(vector: Tensor) -> Tensor:

@@ -24,7 +24,15 @@ from filterlab.render.legend import Legend
 from filterlab.render.sampling import Sampling
 from filterlab.render.shading import Shading
 from filterlab.render.transfer import TransferFunction
-from filterlab.scenes.model import LevelSetModel, Lighting, OnSurface, Scene, SceneMethod, SurfaceOfItsOwn
+from filterlab.scenes.model import (
+    LevelSetModel,
+    Lighting,
+    OnSurface,
+    Scene,
+    SceneMethod,
+    SurfaceOfItsOwn,
+    TerrainModel,
+)
 from filterlab.scenes.shown import Casting, OfField
 from filterlab.scenes.terrain import VIEW, PreparedTerrain, Terrain
 from filterlab.scenes.values import PreparedProjection, PreparedSlice, camera_of, projection, sliced
@@ -164,7 +172,7 @@ def build(scene: Scene, volume: Volume | None = None) -> AnyPrepared:
     Raises ValueError where `method: auto` finds nothing within its budget, with the best there is.
     """
     if scene.terrain is not None:
-        return PreparedTerrain.of(scene, Terrain.of(scene.terrain, scene.terrain.load(), scene.device))
+        return PreparedTerrain.of(scene, _terrain(scene.terrain, scene.device))
     if isinstance(scene.surface, SurfaceOfItsOwn):
         return _alone(scene, scene.surface)
     volume = _volume(scene, volume)
@@ -207,6 +215,14 @@ def _shown(scene: Scene, domain: Domain) -> dict[str, Any]:
         "region": scene.region.build() if scene.region else None,
         "device": scene.device,
     }
+
+
+def _terrain(asked: TerrainModel, device: str) -> Terrain:
+    heights = asked.load()
+    try:
+        return Terrain.of(asked, heights, device)
+    except ValueError as error:
+        raise ValueError(f"{asked.heights}: {error}") from None
 
 
 def _alone(scene: Scene, asked: SurfaceOfItsOwn) -> Casting:

@@ -98,7 +98,7 @@ class Terrain:
     def of(cls, look: TerrainLook, heights: Heights, device: str = "cpu") -> Terrain:
         """Raises ValueError: no height at all; a unit that is none."""
         if heights.missing.all():
-            raise ValueError("expected a height somewhere; got none")
+            raise ValueError(f"expected a height somewhere; all {heights.missing.size} are missing")
         own, scale, shift = local(heights, look.unit)
         return cls(look, own, scale, shift, heights.height_unit or "", heights.crs, device)
 

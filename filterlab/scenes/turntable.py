@@ -12,6 +12,7 @@ from filterlab.scenes.model import Scene
 
 TURN = 4.0
 """Seconds that a turn takes in a picture that moves."""
+_VERTICAL = (0.0, 0.0, 1.0)
 _SHORTEST = 0.02
 """Seconds for which viewers show a picture at least; shorter ones they slow down."""
 
@@ -19,18 +20,21 @@ _SHORTEST = 0.02
 def turntable(prepared: AnyPrepared, count: int) -> list[AnyPrepared]:
     """The views of a whole turn about the axis along `up` through the target, at equal angles, the first ahead.
 
-    The field is that of `prepared`, built once. A camera that frames what is shown keeps the distance from which all of
-    it is in view all the way round: it neither comes nearer nor cuts anything off.
+    A compass that looks straight down or up turns on the spot, about the vertical. The field is that of `prepared`,
+    built once. A camera that frames what is shown keeps the distance from which all of it is in view all the way round:
+    it neither comes nearer nor cuts anything off.
 
     Raises:
         ValueError: fewer than two views; a slice, of which nothing is seen from its side.
     """
     check_turn(prepared.scene, count)
-    turned = [prepared.camera.turned(360 * k / count) for k in range(count)]
-    if prepared.scene.camera.position is None:
-        framed = [_framed(prepared, camera) for camera in turned]
+    view, angles = prepared.scene.camera, [360 * k / count for k in range(count)]
+    axis = _VERTICAL if view.straight else None
+    turned = [prepared.camera.turned(angle, axis) for angle in angles]
+    if view.position is None:
+        framed = [_framed(prepared, camera, angle) for camera, angle in zip(turned, angles, strict=True)]
         first = max(range(count), key=lambda k: _reach(framed[k]))
-        turned = [framed[first].turned(360 * (k - first) / count) for k in range(count)]
+        turned = [framed[first].turned(360 * (k - first) / count, axis) for k in range(count)]
     return [replace(prepared, camera=camera) for camera in turned]
 
 
@@ -42,11 +46,14 @@ def check_turn(scene: Scene, count: int) -> None:
         raise ValueError("a slice has no other sides: expected a medium, a surface or a mip on a turntable")
 
 
-def _framed(prepared: AnyPrepared, camera: Camera) -> Camera:
+def _framed(prepared: AnyPrepared, camera: Camera, angle: float) -> Camera:
     """The camera that looks in the same direction, as near as all that is shown can be seen from there."""
+    view = prepared.scene.camera
+    if view.compass is not None and view.straight:
+        return prepared.framed(view.model_copy(update={"compass": (view.compass[0] - angle, view.compass[1])}))
     position, target = (torch.as_tensor(v, dtype=torch.float64) for v in (camera.position, camera.target))
     looking = {"direction": tuple((target - position).tolist()), "compass": None}
-    return prepared.framed(prepared.scene.camera.model_copy(update=looking))
+    return prepared.framed(view.model_copy(update=looking))
 
 
 def _reach(camera: Camera) -> float:

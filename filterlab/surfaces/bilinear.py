@@ -115,6 +115,7 @@ class BilinearQuads(InTree[described.BilinearQuads]):
     def with_tensors(self, tensors: Sequence[Tensor]) -> BilinearQuads:
         other = copy.copy(self)
         (other.vertices,) = tensors
+        other.quads = self.quads.to(other.vertices.device)
         other._built = None
         return other
 

@@ -58,6 +58,14 @@ class Bounds:
         more = _unit_planes("cuts", planes, len(self)).to(self.planes)
         return Bounds(self.centers, self.radii, torch.cat((self.planes, more), 1), self.boxes, self.corners)
 
+    def to(self, device: torch.device) -> Bounds:
+        """The same there; themselves, if that is where they are."""
+        if self.centers.device == device:
+            return self
+        boxes = Boxes(*(ends.to(device) for ends in self.boxes))
+        corners = None if self.corners is None else self.corners.to(device)
+        return Bounds(self.centers.to(device), self.radii.to(device), self.planes.to(device), boxes, corners)
+
     @staticmethod
     def joined(parts: list[Bounds]) -> Bounds:
         """One after the other."""

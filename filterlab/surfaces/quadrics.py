@@ -209,6 +209,7 @@ class Quadrics(InTree[description.Quadrics]):
     def with_tensors(self, tensors: Sequence[Tensor]) -> Quadrics:
         other = copy.copy(self)
         other.A, other.b, other.c, other.origins = tensors
+        other.bounds = self.bounds.to(other.A.device)
         other._built = None
         return other
 

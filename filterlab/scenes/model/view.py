@@ -91,9 +91,13 @@ class CameraView(Section):
         return OrthographicCamera(**pose, height=self.height)
 
     @property
+    def straight(self) -> bool:
+        """Whether a compass says straight down or up: then azimuth is what is above in the picture."""
+        return self.compass is not None and abs(self.compass[1]) == 90
+
+    @property
     def _up(self) -> Vector:
-        straight = self.compass is not None and abs(self.compass[1]) == 90
-        return toward(self.compass[0], 0) if straight else self.up  # type: ignore[index]
+        return toward(self.compass[0], 0) if self.straight else self.up  # type: ignore[index]
 
     @property
     def framed(self) -> bool:
