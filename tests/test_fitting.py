@@ -155,8 +155,8 @@ def test_noise_above_the_tolerance_is_smoothed_not_followed():
 
 
 def test_strays_are_left_out():
-    points, random = torus(3000), np.random.default_rng(2)
-    strays = random.uniform(-1.4, 1.4, (30, 3))
+    points, random = torus(6000), np.random.default_rng(2)
+    strays = random.uniform(-1.4, 1.4, (60, 3))
     strays = strays[np.abs(off_torus(strays)) > 0.1]
     slim = fit_slim(np.concatenate((points, strays, points[:10])), tolerance=3e-4)
     assert slim.fit is not None
@@ -182,8 +182,8 @@ def test_holes_stay_open_and_all_else_is_closed():
 
 def test_thin_walls_have_two_sides():
     random = np.random.default_rng(0)
-    flat = random.uniform(-1, 1, (3000, 2))
-    points = np.column_stack((flat, np.where(np.arange(3000) % 2, 0.02, -0.02)))
+    flat = random.uniform(-1, 1, (6000, 2))
+    points = np.column_stack((flat, np.where(np.arange(6000) % 2, 0.02, -0.02)))
     slim = fit_slim(points, points * [0, 0, 1], tolerance=1e-4)
     for side in (-1.0, 1.0):
         o = torch.tensor([[0.1, 0.2, side], [-0.5, 0.3, side], [0.7, -0.6, side]], dtype=torch.float64)
