@@ -27,7 +27,7 @@ from experiments.runs import Record, Run, Unit, timed
 from filterlab.io.config import ConfigError, Problem, StrictModel
 from filterlab.io.points import load_points
 from filterlab.scenes.model import find_volume
-from filterlab.surfaces import Slim, fit_slim
+from filterlab.surfaces import Slim, Surface, fit_slim
 
 SECONDS_PER_POINT = 4e-4
 LIFT = 0.05  # diagonals above the surface, where rays begin
@@ -155,11 +155,11 @@ def unblended(slim: Slim) -> Slim:
 
 
 @torch.no_grad()
-def along_normals(shape: Shape, slim: Slim, points: np.ndarray) -> tuple[float, int]:
+def along_normals(shape: Shape, surface: Surface, points: np.ndarray) -> tuple[float, int]:
     """The rms distance of hits of rays down the normals of points from them, in diagonals; how many rays miss."""
     lift = LIFT * shape.diagonal
     p, n = torch.from_numpy(points), torch.from_numpy(shape.normal(points))
-    t = slim.hit(p + lift * n, -n).t
+    t = surface.hit(p + lift * n, -n).t
     hit = (t - lift).abs() < lift / 2
     return float((t[hit] - lift).square().mean().sqrt()) / shape.diagonal, int((~hit).sum())
 

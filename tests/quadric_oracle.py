@@ -122,7 +122,8 @@ def _crossings(quadric: Quadric, e, v) -> list[Crossing]:
         return []
     s, touching = mp.sqrt(max(line.radicand, 0)), line.radicand <= line.slack
     if touching:  # both hits are one, or none: rounding of the radicand counts with its root
-        roots = [(-line.beta / line.alpha, None)] if line.alpha else []
+        one = -line.beta / line.alpha if line.alpha else -line.gamma / (2 * line.beta) if line.beta else None
+        roots = [] if one is None else [(one, None)]
     elif not line.alpha:
         roots = [(-line.gamma / (2 * line.beta), line.beta < 0)]
     else:
@@ -130,7 +131,7 @@ def _crossings(quadric: Quadric, e, v) -> list[Crossing]:
     found = []
     for root, front in roots:
         off = line.moved_alpha * root**2 + 2 * line.moved_beta * abs(root) + line.moved_gamma
-        moved = 2 * mp.sqrt(line.slack) / abs(line.alpha) if touching else off / s
+        moved = 2 * mp.sqrt(line.slack) / abs(line.alpha) if touching and line.alpha else off / s
         moved += ROUNDED * EPS * (abs(root) + abs(line.behind) + mpf(float(quadric.radius)) / mp.sqrt(dot(v, v)))
         kept, surely = _kept(quadric, e, v, line.behind + root, moved)
         if kept:

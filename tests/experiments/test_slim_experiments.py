@@ -4,11 +4,13 @@ import math
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from experiments import quadrics_gallery, slim_error
 from experiments.__main__ import main
 from experiments.runs import read_records
+from experiments.simplified import SmoothTriangles, closed_grid, simplified
 from experiments.slim_error import AXES, RING, SHAPES, TUBE
 from filterlab.io.images import load_image
 
@@ -78,19 +80,50 @@ def test_studies_that_make_no_sense_are_refused(study):
 
 
 def test_every_picture_shows_something_and_is_in_the_report(ran):
-    content = {"experiment": "quadrics_gallery", "points": 1500, "tolerance": 3e-3, "size": [24, 20]}
-    records, folder = ran(content)
-    assert len(records) == sum(map(len, quadrics_gallery.PICTURES.values()))
-    for record in records.values():
-        image = load_image(folder / record["image"])
-        assert float(image.max()) > 0.2 > float(image[0, 0].max())
+    content = {"experiment": "quadrics_gallery", "points": 1500, "tolerance": 3e-3, "size": [24, 20], "samples": 12}
+    records, folder = ran({**content, "scan": "there-is-none.ply", "fuel": {"file": "none.nrrd", "optional": True}})
+    assert {key.split("/")[0] for key in records} == set(quadrics_gallery.PICTURES) - {"scan"}
+    images = {key: load_image(folder / record["image"]) for key, record in records.items()}
+    for image in images.values():
+        assert float(image.max()) > 0.2
     assert records["culling/all"]["left"] < 0.8 * records["culling/all"]["balls"]
-    assert (
-        load_image(folder / records["culling/all"]["image"]) == load_image(folder / records["culling/left"]["image"])
-    ).all()
+    assert (images["culling/all"] == images["culling/left"]).all()
     assert records["edges/cut"]["sharp"] > 0
-    assert records["triangles/mesh"]["rms"] <= records["triangles/cover"]["rms"]
+    assert not (images["quads/bilinear"] == images["quads/two-triangles"]).all()
+    for data in ("fuel", "marschner-lobb"):
+        assert (images[f"levels/{data}-stored"] - images[f"levels/{data}-walked"]).abs().max() < 0.01
+        assert records[f"levels/{data}-stored"]["differ"] == 0 < records[f"levels/{data}-stored"]["tetrahedra"]
+    cover = records["triangles/cover"]["rms"]
+    assert max(records[f"triangles/{name}"]["rms"] for name in ("simplified", "marching-cubes")) <= cover
+    assert records["triangles/simplified"]["triangles"] < records["triangles/marching-cubes"]["triangles"]
     assert (folder / "report.html").read_text().count("data:image/png") == len(records)
+
+
+def test_a_scan_is_covered_and_seen(tmp_path, ran):
+    np.savetxt(tmp_path / "ball.xyz", SHAPES["ellipsoid"].draw(600, 0))
+    content = {"experiment": "quadrics_gallery", "points": 500, "tolerance": 3e-2, "size": [8, 8], "samples": 6}
+    records, folder = ran({**content, "scan": str(tmp_path / "ball.xyz")})
+    image = load_image(folder / records["scan/phong"]["image"])
+    assert float(image[4, 4].max()) > 0.2 > float(image[0, 0].max())
+
+
+def test_meshes_are_simplified_to_an_error_and_shaded_smoothly():
+    shape = SHAPES["torus"]
+    at = np.stack(np.meshgrid(np.arange(60) / 60, np.arange(24) / 24, indexing="ij"), -1)
+    vertices, triangles = closed_grid(torch.from_numpy(shape.at(at)))
+    seen = shape.draw(300, 1)
+    mesh = simplified(vertices, triangles, lambda own: slim_error.along_normals(shape, own, seen)[0], 3e-3)
+    assert len(mesh) < len(triangles) / 2
+    rms, missed = slim_error.along_normals(shape, mesh, seen)
+    assert missed == 0
+    assert 1.5e-3 < rms <= 3e-3
+    points, normals = torch.from_numpy(seen), torch.from_numpy(shape.normal(seen))
+    origins = points + 0.2 * normals
+    fine = SmoothTriangles(vertices, triangles)
+    hit = fine.hit(origins, -normals)
+    smooth, flat = (own(origins, -normals, hit).normal for own in (fine.at, super(SmoothTriangles, fine).at))
+    off, off_flat = ((own - normals).norm(dim=1).square().mean().sqrt() for own in (smooth, flat))
+    assert off < off_flat / 5
 
 
 def test_the_block_has_a_hole_and_outward_normals():
