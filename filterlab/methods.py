@@ -26,6 +26,7 @@ from filterlab.fields.tensor_product import (
     Direct,
     EightTrilinearCubic,
     EightTrilinearQuadratic,
+    Sampled,
     Sampler,
     TrilinearCentral,
     named_sampler,
@@ -39,7 +40,7 @@ from filterlab.ops.differentiable import gather
 from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary, Volume, as_volume, exact_float
 
-SampledScheme = Callable[[Sampler], Scheme]
+SampledScheme = Callable[[Sampler], Sampled]
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,16 @@ class Asked:
         """The samples, filtered if that is asked, padded as a scheme needs and stored; see `Coefficients.of`."""
         chosen, unknown = prefilter if self.prefilter else prefilters.IDENTITY, self.unknown
         return Coefficients.of(
-            self.samples, chosen, self.boundary, scheme.reach, factor, storage, unknown, scheme.single
+            self.samples,
+            chosen,
+            self.boundary,
+            scheme.reach,
+            factor,
+            storage,
+            unknown,
+            scheme.single,
+            scheme.around,
+            scheme.period,
         )
 
 
@@ -229,7 +239,7 @@ class TensorProduct(Method):
         """The ways of evaluating it; the first one that can run is the default."""
         return ("fused", "direct") if self.sampled is None else ("fused", "direct", "sampled")
 
-    def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> Scheme:
+    def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> Direct | Sampled:
         self._check_offered(name, gradient)
         if name == "sampled":
             if (gradient or self.gradients[0]) != self.sampled_gradient:
@@ -250,9 +260,7 @@ class TensorProduct(Method):
         return self.kernel.support + (self.prefilter.decay(torch.float64) if prefilter else 0)
 
     def build(self, volume: Volume, asked: Asked) -> Field:
-        scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
-        if isinstance(scheme, Direct):
-            scheme = scheme.along(volume.size, asked.boundary)
+        scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler).along(volume.size, asked.boundary)
         coefficients = asked.coefficients(self.prefilter, scheme, _storage_for(self, asked.storage), self.factor)
         return GridField(self.name, volume, coefficients, _that_runs(scheme, coefficients, asked))
 
@@ -296,7 +304,7 @@ class Tetrahedral(Method):
             schemes=self.schemes,
         )
 
-    def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> Scheme:
+    def scheme(self, name: str | None, gradient: str | None, sampler: str | Sampler) -> OnTetrahedra:
         self._check_offered(name, gradient)
         if sampler != "exact":
             raise ValueError(f"sampler={sampler!r} needs scheme='sampled'; {self.name} takes no samples between voxels")
@@ -310,7 +318,7 @@ class Tetrahedral(Method):
         return self.spline.support + (self.prefilter.decay(torch.float64) if prefilter else 0)
 
     def build(self, volume: Volume, asked: Asked) -> Field:
-        scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler)
+        scheme = self.scheme(asked.scheme, asked.gradient, asked.sampler).along(volume.size, asked.boundary)
         coefficients = asked.coefficients(self.prefilter, scheme, named_storage(asked.storage))
         return FieldOnTetrahedra(self.name, volume, coefficients, _that_runs(scheme, coefficients, asked))
 

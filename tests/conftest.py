@@ -15,6 +15,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+from tests.forks import forks as forks
+
 with warnings.catch_warnings():  # torch's own forward mode compiles these with a deprecated call, once, at first use
     warnings.simplefilter("ignore", DeprecationWarning)
     import torch._decomp.decompositions_for_jvp

@@ -1,35 +1,23 @@
 """What resampling takes at its peak beyond its input and output, in volumes of the output in float32.
 
-`python -m tests.peak_memory` prints it as JSON for every case. Resident memory only ever has a highest mark, so that
-before each case as much is taken as the mark says, and touched: what goes beyond it is the case's own.
+`python -m tests.peak_memory` prints it as JSON for every case.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import resource
 import sys
-from pathlib import Path
 
 import numpy as np
 import torch
 
 import filterlab as fl
 from filterlab.volume import Volume
+from tests import resident
 
-PAGE = os.sysconf("SC_PAGE_SIZE")
 N, NEW = (80, 90, 100), (120, 135, 150)
 TURNED = np.eye(4)
 TURNED[:3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-
-
-def resident() -> int:
-    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * PAGE
-
-
-def highest() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def volume(dtype: torch.dtype, shape: tuple[int, ...] = N, different: int = 90) -> Volume:
@@ -90,11 +78,9 @@ def beyond(source: Volume, how: dict) -> float:
     """Of one case, after a small one of its kind."""
     grid = {"shape": (5, 6, 7)} if "shape" in how else {"like": Volume(torch.zeros(5, 6, 7), affine=how["like"].affine)}
     fl.resample(Volume(source.samples[..., :9, :8, :7].contiguous()), **(how | grid))
-    ballast = np.ones(max(highest() - resident(), 0), np.uint8)
-    before = highest()
+    before = resident.begin()
     out = fl.resample(source, **how).samples
-    taken = highest() - before - out.numel() * out.element_size()
-    del ballast
+    taken = resident.highest() - before - out.numel() * out.element_size()
     return taken / (4 * out.numel())
 
 

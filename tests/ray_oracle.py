@@ -3,8 +3,8 @@
 Nothing here imports filterlab. Between two planes of knots f(o + t d) is a polynomial of degree n; it is the one
 through n + 1 values of the sum over taps, written out from the kernels' textbook formulas. Its critical points are
 eigenvalues of the colleague matrix of its derivative; between neighbours of all ends and critical points it is
-monotone, so that every change of sign is one crossing, which bisection finds. Rays are `longdouble`, so that far
-origins round nothing.
+monotone, so that every change of sign is one crossing, which bisection finds. Rays are measured from where they enter
+the domain, found in `longdouble`, so that far origins round nothing.
 
 Where f comes closer to the level than `close` without a clear crossing (at a critical point, or an end of the domain),
 rounding decides what there is to hit: such rays are *undecided*.
@@ -22,6 +22,7 @@ from numpy.polynomial import chebyshev
 from tests import oracles
 
 DEGREES = {"trilinear": 3, "ncrsi": 5, "triquadratic": 6, "notch": 6, "catmull-rom": 9, "mitchell": 9, "tricubic": 9}
+_NONE = 1e-12  # pieces that are shorter, of the way in the domain, are none
 _MARGIN = 6  # coefficients that are written out beyond the ends: the domain reaches ½ beyond, kernels 2
 
 
@@ -76,43 +77,71 @@ class Sum:
 
 def crossings(f: Sum, origins: np.ndarray, directions: np.ndarray, level: float, close: float = 1e-11) -> list[Truth]:
     """Those of rays (R, 3) in voxel coordinates with the level, within the domain [−½, n − ½]³ and t ≥ 0."""
-    o, d = (np.asarray(x, dtype=np.longdouble) for x in (origins, directions))
-    ends = [_ends(f, *ray) for ray in zip(o, d, strict=True)]
-    ray = np.repeat(np.arange(len(o)), [max(len(e) - 1, 0) for e in ends])
-    if not len(ray):
-        return [Truth(np.zeros(0), np.inf)] * len(o)
-    low = np.concatenate([e[:-1] for e in ends])
-    high = np.concatenate([e[1:] for e in ends])
+    met, start, entry, length = entered(np.array(f.size), origins, directions)
+    d = np.asarray(directions, dtype=np.float64)[met]
+    every = np.arange(len(met))
+    planes = [passed(np.arange(-1, n + 1) + f.knots - entry[:, a, None], d[:, a, None]) for a, n in enumerate(f.size)]
+    line, near, far, _ = cut(every, 0 * length, length, np.concatenate(planes, 1), length)
     nodes = chebyshev.chebpts1(f.degree + 1)
-    t = low[:, None] + (high - low)[:, None] * (nodes + 1) / 2
-    values = f((o[ray, None] + t[..., None] * d[ray, None]).reshape(-1, 3)).reshape(t.shape) - level
+    t = near[:, None] + (far - near)[:, None] * (nodes + 1) / 2
+    values = f((entry[line, None] + t[..., None] * d[line, None]).reshape(-1, 3)).reshape(t.shape) - level
     c = np.linalg.solve(chebyshev.chebvander(nodes, f.degree), values.T)  # (n + 1, P)
-    return of_pieces(len(o), ray, low, high, c, close)
+    some = near_level(c, close)
+    ray, (low, high) = met[line], (start[line] + s for s in (near, far))
+    return of_pieces(len(origins), ray[some], low[some], high[some], c[:, some], close)
+
+
+def near_level(c: np.ndarray, close: float) -> np.ndarray:
+    """(P,) of polynomials (n + 1, P) those that may come near 0."""
+    return np.abs(c[0]) <= np.abs(c[1:]).sum(0) + close
+
+
+# ---- rays in pieces
+
+
+def entered(size: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Which rays meet the domain; of these t and place of entry, and how far they go from there, in units of d."""
+    o, d = (np.asarray(x, dtype=np.longdouble) for x in (origins, directions))
+    low, high = np.full(3, -0.5), size - 0.5
+    still = d == 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.sort(np.stack([(low - o) / d, (high - o) / d]), 0)
+    ends[:, still] = np.array([[-np.inf], [np.inf]])
+    near, far = np.maximum(ends[0].max(-1), 0), ends[1].min(-1)
+    within = (((o >= low) & (o <= high)) | ~still).all(-1)
+    met = np.nonzero((near < far) & within)[0]
+    entry = np.clip((o + near[:, None] * d)[met], low, high)
+    return met, near[met], entry.astype(np.float64), (far - near)[met].astype(np.float64)
+
+
+def passed(distance: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Where planes are passed that are so far away; ∞ where never."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(speed == 0, np.inf, distance / speed)
+
+
+def cut(line, near, far, events, length) -> tuple[np.ndarray, ...]:
+    """Pieces (P) of lines, cut at the events (P, K) within them: lines, near, far, and which pieces they were of."""
+    at = np.sort(np.clip(events, near[:, None], far[:, None]), 1)
+    at[np.diff(at, axis=1, prepend=near[:, None]) <= _NONE * length[line, None]] = np.nan  # cut there already
+    at[(far[:, None] - at) <= _NONE * length[line, None]] = np.nan
+    of, k = np.nonzero(~np.isnan(at))
+    every = np.concatenate((np.arange(len(line)), of))
+    start = np.concatenate((near, at[of, k]))
+    order = np.lexsort((start, every))
+    every, start = every[order], start[order]
+    last = np.append(every[1:] != every[:-1], True)[: len(every)]
+    end = np.where(last, far[every], np.append(start[1:], 0)[: len(every)])
+    return line[every], start, end, every
+
+
+# ---- polynomials
 
 
 def of_pieces(rays: int, ray, low, high, c, close: float) -> list[Truth]:
     """Zeros of polynomials with Chebyshev coefficients (n + 1, P) on [low, high] (P), in the order of their rays."""
     stops = np.sort(np.concatenate((-np.ones((len(ray), 1)), _critical(c), np.ones((len(ray), 1))), 1), 1)
     return _between(rays, ray, low, high, c, stops, close)
-
-
-def _ends(f: Sum, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """t at which a ray enters the domain, passes planes of knots, and leaves it."""
-    near, far = np.longdouble(0), np.longdouble(np.inf)
-    for x, v, n in zip(o, d, f.size, strict=True):
-        if v == 0:
-            if not -0.5 <= x <= n - 0.5:
-                return np.zeros(0)
-            continue
-        a, b = sorted(((-0.5 - x) / v, (n - 0.5 - x) / v))
-        near, far = max(near, a), min(far, b)
-    if not near < far:
-        return np.zeros(0)
-    planes = [(np.arange(-1, n + 1) + f.knots - x) / v for x, v, n in zip(o, d, f.size, strict=True) if v != 0]
-    inner = np.concatenate(planes)
-    inner = np.sort(inner[(inner > near) & (inner < far)])
-    every = np.concatenate(([near], inner, [far]))
-    return np.concatenate((every[:1], every[1:][np.diff(every) > 1e-12 * (1 + abs(every[1:]))]))
 
 
 def _critical(c: np.ndarray) -> np.ndarray:

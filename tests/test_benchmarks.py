@@ -29,6 +29,7 @@ from benchmarks.registry import COMPARISONS, UnknownNameError, chosen
 from benchmarks.scene import BRICK, blobs, marschner_lobb
 from benchmarks.settings import Settings
 from filterlab import costs, kernels
+from filterlab.ops.cpu import compiler
 
 TINY = Settings(
     repeats=1,
@@ -404,14 +405,15 @@ def test_what_torch_compile_is_given_runs(monkeypatch):
         assert asked[-1]().requires_grad
 
 
-def test_a_probe_runs_in_a_process_of_its_own(tmp_path):
+def test_a_probe_runs_in_a_process_of_its_own(forks, tmp_path, monkeypatch):
+    monkeypatch.setattr(compiler, "_programs", {})
     cache = tmp_path / "programs"
     found = probe.measured("first_call", {"FILTERLAB_CACHE": str(cache)}, methods=["trilinear"])
     assert found["trilinear"] > 0
     assert list(cache.iterdir()), "the program was compiled there"
 
 
-def test_a_probe_that_fails_says_why():
+def test_a_probe_that_fails_says_why(forks):
     with pytest.raises(probe.ProbeError, match=r"memory: TypeError: .*voxels"):
         probe.measured("memory")
 

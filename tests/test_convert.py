@@ -20,6 +20,7 @@ from filterlab import Volume, load_volume, save_volume
 from filterlab.cli import main
 from filterlab.io import FORMATS, describe
 from filterlab.world import LPS, RAS, World
+from tests import resident
 from tests.io.writers import AFFINE, ENDINGS, SAMPLES, write_any, write_nifti, write_nrrd
 
 WRITTEN = [ending for known in FORMATS.values() for ending in known.written]
@@ -226,26 +227,23 @@ PEAK = """
 import json, sys
 import nibabel, torch, filterlab.io.nifti, filterlab.io.volumes
 from filterlab.cli import main
-def peak():
-    return next(1024 * int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM"))
+from tests import resident
 for line in json.loads(sys.argv[1]):
-    open("/proc/self/clear_refs", "w").write("5")  # the peak begins anew
-    before = peak()
+    before = resident.begin()
     assert main(line) == 0
-    print("peak", peak() - before, file=sys.stderr)
+    print("peak", resident.highest() - before, file=sys.stderr)
 """
 
 
 def extra_memory(lines: list[list[str]]) -> list[int]:
     """Bytes by which the most memory grows while each of the commands runs."""
     command = [sys.executable, "-c", PEAK, json.dumps(lines)]
-    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "1000000"}  # what is freed goes back, and is counted again
     root = Path(__file__).parents[1]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root, env=resident.ENVIRONMENT)
     return [int(line.split()[1]) for line in done.stderr.splitlines() if line.startswith("peak")]
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the system does not tell the peak of a part")
+@pytest.mark.skipif(not resident.CAN_BE_TOLD, reason="the system does not tell the peak of a part")
 def test_converting_and_looking_take_the_memory_of_one_volume(tmp_path: Path) -> None:
     """Of one as it is held: uint16, which torch lacks, is held in 4 bytes, and 2 more while it is read."""
     count, volumes, lines = 200, {"uint8": 1.0, "float32": 1.0, "uint16": 3.0}, []

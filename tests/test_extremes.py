@@ -7,7 +7,7 @@ from operator import attrgetter
 
 import pytest
 
-from experiments.extremes import CASES, document
+from experiments.extremes import CASES, document, processes
 from experiments.extremes.contract import Case, Finding, Subject, Tally, random_numbers
 from tests.pairs import covering
 
@@ -24,7 +24,9 @@ BY_CASE = covering(((case, subject) for case in CASES.values() for subject in ca
 
 
 @pytest.mark.parametrize(("case", "subject"), BY_CASE, ids=[f"{case.key}-{subject.key}" for case, subject in BY_CASE])
-def test_the_contract_is_kept(case: Case, subject: Subject) -> None:
+def test_the_contract_is_kept(case: Case, subject: Subject, request: pytest.FixtureRequest) -> None:
+    if case not in processes.CASES:  # those are about how a process of its own begins and ends
+        request.getfixturevalue("forks")
     finding = case.run(subject, seed=2, amount=case.tested)
     if finding.skipped:
         pytest.skip(finding.skipped)

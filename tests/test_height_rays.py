@@ -206,7 +206,7 @@ def test_hits_are_differentiable_twice_in_heights_and_rays(name):
 
     assert bool((t(heights, origins, directions) < torch.inf).all())
     assert torch.autograd.gradcheck(t, (heights, origins, directions))
-    assert torch.autograd.gradgradcheck(t, (heights, origins, directions))
+    assert torch.autograd.gradgradcheck(t, (heights, origins, directions), fast_mode=name != "c0")
 
 
 # ---- what changes, what is refused

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import subprocess
 import sys
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from filterlab.kernels import bc
 from filterlab.methods import METHODS, reconstruct
 from filterlab.resampling import resample
 from filterlab.volume import Boundary, Volume
-from tests import laws, oracles
+from tests import laws, oracles, resident
 from tests.pairs import in_pairs
 from tests.test_volume import rotated
 
@@ -304,12 +302,11 @@ def test_what_is_far_from_the_origin_loses_no_digits(method, turned):
     laws.assert_close(found.samples, exact.samples, 3e-6)
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux what memory is resident")
+@pytest.mark.skipif(not resident.CAN_BE_TOLD, reason="the system does not tell the peak of a part")
 def test_memory_beyond_input_and_output_is_less_than_a_volume():
     """By any method, type and boundary, on coarser and turned grids too; a tenth where nothing but sums is needed."""
-    allocator = {"MALLOC_MMAP_THRESHOLD_": "131072", "OMP_NUM_THREADS": "1"}  # what is freed goes back at once
     command = [sys.executable, "-W", "ignore", "-m", "tests.peak_memory"]
-    done = subprocess.run(command, env=os.environ | allocator, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, env=resident.ENVIRONMENT, capture_output=True, text=True, check=True)
     taken = json.loads(done.stdout)
     assert len(taken) == 25
     assert max(taken.values()) <= 1, taken

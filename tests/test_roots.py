@@ -329,7 +329,7 @@ def test_roots_are_differentiable_twice_in_every_mode(degree):
     finite = lambda t: torch.where(t < INF, t, 0)  # noqa: E731
     for solve in (lambda x: finite(first_root(x)), lambda x: finite(all_roots(x).t)):
         assert torch.autograd.gradcheck(solve, c, check_forward_ad=True)
-        assert torch.autograd.gradgradcheck(solve, c, atol=1e-4, rtol=1e-3)
+        assert torch.autograd.gradgradcheck(solve, c, atol=1e-4, rtol=1e-3, fast_mode=degree == 4)
 
 
 @pytest.mark.parametrize("degree", range(1, 10))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,6 +17,7 @@ from filterlab.scenes.build import build
 from filterlab.scenes.model import Scene
 from filterlab.scenes.plan import SurfacePlan, plan
 from filterlab.scenes.plan_report import table
+from tests import resident
 
 BASE = """
 signal: {name: sphere, samples: 24}
@@ -183,46 +182,42 @@ def test_the_command(tmp_path, capsys) -> None:
 
 GROWTH = """
 import sys
-from pathlib import Path
 
 import torch
 from filterlab.methods import reconstruct
 from filterlab.render import PerspectiveCamera, TransferFunction
 from filterlab.render.dvr import prepare
 from filterlab.render.sampling import Sampling
-
-def status(name):
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return 1024 * int(next(line for line in lines if line.startswith(name)).split()[1])
+from tests import resident
 
 field = reconstruct(torch.rand(3, 3, 3), "trilinear")
 transfer = TransferFunction([0.0, 1.0], [[1.0, 0.5, 0.2]] * 2, [0.1, 0.2])
-camera, sampling = PerspectiveCamera.framing(field.domain, margin=3.0), Sampling(step=10.0, memory=int(sys.argv[1]))
-prepare(field, camera, transfer, size=(64, 64), sampling=sampling).run()  # what is compiled is there now
-frame = prepare(field, camera, transfer, size=(800, 700), sampling=sampling)
-said, image = (frame.image_bytes, frame.ray_bytes), None
-del frame
-Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak begins anew
-before = status("VmRSS")
-image = prepare(field, camera, transfer, size=(800, 700), sampling=sampling).run()
-print(field.scheme.name, image.nbytes, *said, status("VmHWM") - before)
+camera = PerspectiveCamera.framing(field.domain, margin=3.0)
+for memory in map(int, sys.argv[1:]):
+    sampling = Sampling(step=10.0, memory=memory)
+    prepare(field, camera, transfer, size=(64, 64), sampling=sampling).run()  # what is compiled is there now
+    frame = prepare(field, camera, transfer, size=(800, 700), sampling=sampling)
+    said, image = (frame.image_bytes, frame.ray_bytes), None
+    del frame
+    before = resident.begin()
+    image = prepare(field, camera, transfer, size=(800, 700), sampling=sampling).run()
+    print(field.scheme.name, image.nbytes, *said, resident.highest() - before)
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the system does not tell the peak of a part")
-@pytest.mark.parametrize("memory", [2**22, 2**28])
-def test_an_image_takes_the_memory_that_is_said(memory: int) -> None:
+@pytest.mark.skipif(not resident.CAN_BE_TOLD, reason="the system does not tell the peak of a part")
+def test_an_image_takes_the_memory_that_is_said() -> None:
     """16 bytes a pixel and the rays in work or kept; in a process of its own, which has no memory of its past."""
-    command = [sys.executable, "-c", GROWTH, str(memory)]
-    told = subprocess.run(
-        command, capture_output=True, text=True, check=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
-    )
-    scheme, *numbers = told.stdout.split()
-    image, image_said, rays_said, peak = map(int, numbers)
-    assert scheme == "fused"
-    assert image == image_said == 16 * 800 * 700
-    # 16 MiB for what the allocator and the threads take
-    assert 0.5 * image < peak <= image + rays_said + 2**24
+    command = [sys.executable, "-c", GROWTH, str(2**22), str(2**28)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=resident.ENVIRONMENT)
+    for line in done.stdout.splitlines():
+        scheme, *numbers = line.split()
+        image, image_said, rays_said, peak = map(int, numbers)
+        assert scheme == "fused"
+        assert image == image_said == 16 * 800 * 700
+        # 16 MiB for what the allocator and the threads take
+        assert 0.5 * image < peak <= image + rays_said + 2**24
+    assert len(done.stdout.splitlines()) == 2
 
 
 def test_the_plan_of_a_surface_counts_what_may_hold_the_level() -> None:

@@ -18,11 +18,26 @@ from filterlab.methods import METHODS, from_kernel
 from filterlab.render import PerspectiveCamera
 from filterlab.surfaces import LevelSet
 from tests import laws, ray_oracle
+from tests.level_set_rays import (
+    BOUNDARIES,
+    CLASSES,
+    FAULTS,
+    SIZE,
+    Case,
+    axis_parallel,
+    campaign,
+    from_far,
+    inside_out,
+    on_faces,
+    one,
+    random,
+    through_edges_and_corners,
+)
 from tests.pairs import covering
+from tests.ray_oracle import DEGREES
 from tests.test_methods import CONTINUOUS
 
-BOUNDARIES = [str(b) for b in fl.Boundary]
-SIZE = np.array([7, 6, 5])
+NEAR = (random, axis_parallel, on_faces, through_edges_and_corners, inside_out)
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
@@ -41,66 +56,28 @@ def ball(n: int = 12) -> Tensor:
     return -sum(c * c for c in grid(n))
 
 
-# ---- classes of rays, in voxel coordinates of a volume of SIZE
-
-
-def random(rng: np.random.Generator, count: int):
-    origins = rng.normal(size=(count, 3)) * 10 + SIZE / 2
-    return origins, (rng.uniform(0, 1, (count, 3)) * SIZE - origins) * rng.uniform(0.1, 10, (count, 1))
-
-
-def axis_parallel(rng: np.random.Generator, count: int):
-    origins, axis = rng.uniform(-0.4, 1, (count, 3)) * (SIZE - 1), np.arange(count) % 3
-    sign = rng.choice([-1.0, 1.0], count)
-    origins[np.arange(count), axis] -= sign * 12
-    return origins, np.eye(3)[axis] * sign[:, None]
-
-
-def on_faces(rng: np.random.Generator, count: int):
-    """Within planes of knots, of either parity."""
-    origins, directions = random(rng, count)
-    axis = np.arange(count) % 3
-    origins[np.arange(count), axis] = rng.integers(0, 8, count) % (2 * SIZE[axis] - 1) / 2
-    directions[np.arange(count), axis] = 0
-    return origins, directions
-
-
-def through_edges_and_corners(rng: np.random.Generator, count: int):
-    steps = rng.integers(-2, 3, (count, 3)).astype(float)
-    steps[(steps == 0).all(1)] = 1
-    through = rng.integers(0, 2 * SIZE, (count, 3)) / 2
-    return through - 16 * steps, steps
-
-
-def inside_out(rng: np.random.Generator, count: int):
-    return rng.uniform(-0.5, 0.5, (count, 3)) + rng.uniform(0, 1, (count, 3)) * (SIZE - 1), rng.normal(size=(count, 3))
-
-
-def from_far(rng: np.random.Generator, count: int):
-    origins, directions = random(rng, count)
-    return origins - 1e6 * directions / np.linalg.norm(directions, axis=1, keepdims=True), directions
-
-
-NEAR = (random, axis_parallel, on_faces, through_edges_and_corners, inside_out)
+def random_rays(seed: int, count: int) -> tuple[Tensor, Tensor]:
+    """At a volume of SIZE, in voxel coordinates."""
+    size = Case("trilinear", np.zeros(SIZE[::-1]), "mirror", 0.5)
+    origins, directions = random(np.random.default_rng(seed), size, count)
+    return torch.from_numpy(origins), torch.from_numpy(directions)
 
 
 def assert_all_found(method: str, boundary: str, classes, count: int, seed: int, level: float = 0.5) -> dict[str, int]:
     rng = np.random.default_rng(seed)
-    samples = rng.random(SIZE[::-1])
-    origins, directions = (np.concatenate(x) for x in zip(*(rays(rng, count) for rays in classes), strict=True))
+    case = Case(method, rng.random(SIZE[::-1]), boundary, level)
+    rays = [np.concatenate(x) for x in zip(*(make(rng, case, count) for make in classes), strict=True)]
     far = from_far in classes
-    f = ray_oracle.Sum(method, samples, boundary)
-    truth = ray_oracle.crossings(f, origins, directions, level, 3e-8 if far else 1e-11)
-    surface = LevelSet(fl.reconstruct(torch.from_numpy(samples), method, boundary=boundary), level)
-    o, d = torch.from_numpy(origins), torch.from_numpy(directions)
+    truth, surface = case.truth((rays[0], rays[1]), 3e-8 if far else 1e-11), case.surface()
+    o, d = map(torch.from_numpy, rays)
     hits, first = surface.hits(o, d, 40), surface.hit(o, d)
     for t in (hits.t, first.t[:, None]):
         verdict = ray_oracle.judged(truth, t.numpy(), 1e-6 if far else 1e-9)
         assert verdict["missed"] == verdict["invented"] == verdict["misplaced"] == 0, (method, boundary, verdict)
     last = surface.hits(o, d, 1, farthest=True).t[:, 0]
     assert torch.equal(last[first.valid], hits.t[first.valid].nan_to_num(posinf=-1).amax(-1))
-    values = f(surface.at(o, d, first).point[first.valid].numpy())
-    assert np.abs(values - level).max(initial=0) <= 1e-12 * np.ptp(samples)
+    values = case.sum(surface.at(o, d, first).point[first.valid].numpy())
+    assert np.abs(values - level).max(initial=0) <= 1e-12 * np.ptp(case.samples)
     return verdict
 
 
@@ -118,6 +95,19 @@ def test_every_crossing_is_found_and_no_other(method, boundary):
     assert sum(count["undecided"] for count in counts) <= 3
 
 
+@pytest.mark.parametrize(("method", "kind"), covering(product(DEGREES, CLASSES), lambda method, kind: (method, kind)))
+def test_rays_of_every_class(method, kind):
+    """`campaign` takes all of them, and as many rays as there is time."""
+    verdict = one(method, kind, BOUNDARIES[len(method + kind) % 5], 40, 2)
+    assert not any(verdict[fault] for fault in FAULTS), verdict
+    assert verdict["undecided"] <= verdict["rays"] / 4
+
+
+def test_a_campaign_counts_what_it_did():
+    found = campaign(0.3, rays=5)
+    assert sum(verdict["rays"] for verdict in found.values()) >= 5
+
+
 @pytest.mark.parametrize(("method", "boundary", "seed"), [("triquadratic", "border", 1404), ("tricubic", "wrap", 1418)])
 def test_nearly_tangent_rays_from_far(method, boundary, seed):
     """Off by 2e-11 once: a slope of 0.03 makes of the rounding of o + t d thirty times as long a way."""
@@ -129,7 +119,7 @@ def test_oblique_geometry_moves_nothing(method):
     samples = noise(5, 6, 7)
     affine = np.array([[1.0, 0.2, 0.0, 3.0], [0.0, 0.5, 0.1, 1.0], [0.1, 0.0, 2.0, -5.0], [0.0, 0.0, 0.0, 1.0]])
     plain, oblique = (LevelSet(fl.reconstruct(v, method), 0.5) for v in (samples, fl.Volume(samples, affine=affine)))
-    origins, directions = map(torch.from_numpy, random(np.random.default_rng(3), 60))
+    origins, directions = random_rays(3, 60)
     geometry = oblique.domain.geometry
     moved = geometry.to_world(origins), geometry.to_world(directions) - geometry.to_world(torch.zeros(3).double())
     a, b = (s.hits(*rays, 20).t for s, rays in ((plain, (origins, directions)), (oblique, moved)))
@@ -185,7 +175,7 @@ def test_closed_level_sets_are_crossed_an_even_number_of_times(method):
     samples = torch.zeros(14, 14, 14, dtype=torch.float64)
     samples[4:-4, 4:-4, 4:-4] = noise(6, 6, 6)
     surface = LevelSet(fl.reconstruct(samples, method), 0.45)
-    origins, directions = map(torch.from_numpy, random(np.random.default_rng(5), 400))
+    origins, directions = random_rays(5, 400)
     origins = origins + torch.tensor([3.5, 4, 4.5]) - 60 * torch.nn.functional.normalize(directions, dim=-1)
     count = surface.hits(origins, directions, 60).valid.sum(-1)
     assert int(count.max()) > 2
@@ -214,7 +204,7 @@ def test_no_ray_slips_through(method, boundary, dtype):
 def test_float32_differs_by_rounding_only():
     for method in CONTINUOUS:
         surface = LevelSet(fl.reconstruct(noise(5, 6, 7), method, storage="float32"), 0.5)
-        origins, directions = (torch.from_numpy(x).float() for x in random(np.random.default_rng(2), 300))
+        origins, directions = (x.float() for x in random_rays(2, 300))
         single, double = surface.hit(origins, directions), surface.hit(origins.double(), directions.double())
         assert single.t.dtype == torch.float32
         point, d = surface.at(origins.double(), directions.double(), double), directions.double()
@@ -306,7 +296,7 @@ def test_nothing_behind_the_origin_is_hit_and_the_surface_at_it_is():
 @pytest.mark.parametrize("level", [-1e9, 50.0, 1e300])
 def test_a_level_that_no_value_has_hits_nothing(level):
     surface = LevelSet(fl.reconstruct(noise(6, 6, 6), "tricubic"), level)
-    origins, directions = map(torch.from_numpy, random(np.random.default_rng(0), 50))
+    origins, directions = random_rays(0, 50)
     assert not bool(surface.hit(origins, directions).valid.any())
     assert surface.relevant() == (0, 0)
 
@@ -335,7 +325,7 @@ def test_missing_voxels_are_holes(method):
 @pytest.mark.parametrize("scheme", ["fused", "direct"])
 def test_rays_of_any_shape_and_memory_by_parts(scheme, monkeypatch):
     surface = LevelSet(fl.reconstruct(noise(6, 6, 6), "triquadratic", scheme=scheme), 0.5)
-    origins, directions = map(torch.from_numpy, random(np.random.default_rng(4), 60))
+    origins, directions = random_rays(4, 60)
     t = surface.hit(origins, directions).t
     sheets = surface.hits(origins, directions, 3)
     monkeypatch.setattr("filterlab.surfaces.level_set.RAYS_AT_ONCE", 7)
@@ -447,7 +437,7 @@ def assert_differentiable(method: str, order: int, rays, *numbers, thoroughly: b
 
 def test_derivatives_change_no_bit():
     field = fl.reconstruct(noise(6, 6, 6), "tricubic")
-    origins, directions = map(torch.from_numpy, random(np.random.default_rng(4), 40))
+    origins, directions = random_rays(4, 40)
     plain = LevelSet(field, 0.5).hit(origins, directions).t
     assert torch.equal(LevelSet(field, 0.5).hit(origins.requires_grad_(), directions).t.detach(), plain)
     assert not plain.requires_grad

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from tests import laws, tetrahedral_oracle, tetrahedral_ray_oracle
+from tests.level_set_rays import BOUNDARIES, FAULTS, of_first, random
 from tests.tetrahedral_oracle import SPLINES
 from tests.tetrahedral_ray_oracle import Polynomials, crossings
-from tests.tetrahedral_rays import BOUNDARIES, CLASSES, FAULTS, SIZE, campaign, noise, of_first, one, random
+from tests.tetrahedral_rays import CLASSES, SIZE, campaign, noise, one
 
 every_spline = pytest.mark.parametrize("name", SPLINES)
 
@@ -92,7 +93,7 @@ def test_verdicts_see_what_is_wrong():
 def test_every_crossing_is_found_and_no_other(name, kind):
     """Boundaries in turn, with and without prefilter: `campaign` takes them all, and as many rays as there is time."""
     number, seed = list(CLASSES).index(kind), list(SPLINES).index(name)
-    verdict = one(name, BOUNDARIES[(number + seed) % 5], bool((number + seed) % 2), kind, 60, 10 * number + seed)
+    verdict = one(name, kind, BOUNDARIES[(number + seed) % 5], bool((number + seed) % 2), 60, 10 * number + seed)
     assert not any(verdict[fault] for fault in FAULTS), verdict
     assert verdict["undecided"] <= (30 if kind == "the level at a vertex" else 2)  # where qss has kinks rays touch it
     assert verdict["sheets rays"] > verdict["undecided"]

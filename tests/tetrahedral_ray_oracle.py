@@ -14,12 +14,11 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from tests import ray_oracle, tetrahedral_oracle
-from tests.ray_oracle import Truth
+from tests.ray_oracle import Truth, cut, entered, near_level, passed
 from tests.tetrahedral_oracle import SPLINES, signed_permutations
 
 _MARGIN = 3  # cells beyond the ends of which polynomials are known
 _AT_ONCE = 1 << 13  # points that are located together: what is tried for them stays in cache
-_NONE = 1e-12  # pieces that are shorter, of the way in the domain, are none
 
 _OUTER = {False: [((1, 0, 0), 0.5)], True: [((1, 0, 0), 0.5), ((1, 1, 1), 0.0)]}
 """Body-centred or not -> (n, k₀) of the planes n · x ∈ ℤ + k₀ between cells."""
@@ -90,34 +89,19 @@ class Polynomials:
 
 def crossings(f: Polynomials, origins: np.ndarray, directions: np.ndarray, level: float, close=1e-11) -> list[Truth]:
     """Those of rays (R, 3) in voxel coordinates with the level, within the domain [−½, n − ½]³ and t ≥ 0."""
-    met, start, entry, length = _entered(f, origins, directions)
+    met, start, entry, length = entered(f.size, origins, directions)
     d = np.asarray(directions, dtype=np.float64)[met]
     every = np.arange(len(met))
-    line, near, far, _ = _cut(every, 0 * length, length, _outer_events(f, entry, d, length), length)
+    line, near, far, _ = cut(every, 0 * length, length, _outer_events(f, entry, d, length), length)
     cells = f.cells(entry[line] + ((near + far) / 2)[:, None] * d[line])
-    line, near, far, of = _cut(line, near, far, _inner_events(f, entry[line], d[line], cells), length)
+    line, near, far, of = cut(line, near, far, _inner_events(f, entry[line], d[line], cells), length)
     nodes = chebyshev.chebpts1(f.degree + 1)
     ends = (entry[line] + s[:, None] * d[line] for s in (near, far))
     values = f.on_pieces(cells[of], *ends, (nodes + 1) / 2) - level
     c = np.linalg.solve(chebyshev.chebvander(nodes, f.degree), values.T)
-    some = np.abs(c[0]) <= np.abs(c[1:]).sum(0) + close  # of the others no value is near the level
+    some = near_level(c, close)
     ray, (low, high) = met[line], (start[line] + s for s in (near, far))
     return ray_oracle.of_pieces(len(origins), ray[some], low[some], high[some], c[:, some], close)
-
-
-def _entered(f: Polynomials, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Which rays meet the domain; of these t and place of entry, and how far they go from there, in units of d."""
-    o, d = (np.asarray(x, dtype=np.longdouble) for x in (origins, directions))
-    low, high = np.full(3, -0.5), f.size - 0.5
-    still = d == 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.sort(np.stack([(low - o) / d, (high - o) / d]), 0)
-    ends[:, still] = np.array([[-np.inf], [np.inf]])
-    near, far = np.maximum(ends[0].max(-1), 0), ends[1].min(-1)
-    within = (((o >= low) & (o <= high)) | ~still).all(-1)
-    met = np.nonzero((near < far) & within)[0]
-    entry = np.clip((o + near[:, None] * d)[met], low, high)
-    return met, near[met], entry.astype(np.float64), (far - near)[met].astype(np.float64)
 
 
 def _outer_events(f: Polynomials, o: np.ndarray, d: np.ndarray, length: np.ndarray) -> np.ndarray:
@@ -127,31 +111,11 @@ def _outer_events(f: Polynomials, o: np.ndarray, d: np.ndarray, length: np.ndarr
         speed, ends = d @ n, np.sort(np.stack((o @ n - k, (o + length[:, None] * d) @ n - k)), 0)
         first = np.ceil(ends[0])
         plane = first[:, None] + np.arange(int((ends[1] - first).max(initial=-1)) + 2)
-        found.append(_met(plane - (o @ n - k)[:, None], speed[:, None]))
+        found.append(passed(plane - (o @ n - k)[:, None], speed[:, None]))
     return np.concatenate(found, 1)
 
 
 def _inner_events(f: Polynomials, o: np.ndarray, d: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """(P, M): where they pass planes through the centres of cells."""
     n = inner(f.name).T
-    return _met((cells + float(f.spline.shift) - o) @ n, d @ n)
-
-
-def _met(distance: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(speed == 0, np.inf, distance / speed)
-
-
-def _cut(line, near, far, events, length) -> tuple[np.ndarray, ...]:
-    """Pieces (P) of lines, cut at the events (P, K) within them: lines, near, far, and which pieces they were of."""
-    at = np.sort(np.clip(events, near[:, None], far[:, None]), 1)
-    at[np.diff(at, axis=1, prepend=near[:, None]) <= _NONE * length[line, None]] = np.nan  # cut there already
-    at[(far[:, None] - at) <= _NONE * length[line, None]] = np.nan
-    of, k = np.nonzero(~np.isnan(at))
-    every = np.concatenate((np.arange(len(line)), of))
-    start = np.concatenate((near, at[of, k]))
-    order = np.lexsort((start, every))
-    every, start = every[order], start[order]
-    last = np.append(every[1:] != every[:-1], True)[: len(every)]
-    end = np.where(last, far[every], np.append(start[1:], 0)[: len(every)])
-    return line[every], start, end, every
+    return passed((cells + float(f.spline.shift) - o) @ n, d @ n)

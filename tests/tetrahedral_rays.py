@@ -7,25 +7,34 @@ GPU: rays, seed and device may be left out.
 from __future__ import annotations
 
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import count, product
+from functools import partial
+from itertools import product
 
 import numpy as np
 import torch
 
 import filterlab as fl
 from filterlab.surfaces import LevelSet
-from tests import ray_oracle, tetrahedral_oracle
+from tests import level_set_rays, tetrahedral_oracle
+from tests.level_set_rays import (
+    BOUNDARIES,
+    FAULTS,
+    Rays,
+    axis_parallel,
+    from_far,
+    grazing,
+    in_last_faces,
+    inside_out,
+    random,
+)
+from tests.ray_oracle import Truth
 from tests.tetrahedral_oracle import SPLINES
 from tests.tetrahedral_ray_oracle import Polynomials, crossings
 
-SIZE = np.array([7, 6, 5])
-SHEETS = 64
-BOUNDARIES = [str(b) for b in fl.Boundary]
-Rays = tuple[np.ndarray, np.ndarray]
+SIZE = level_set_rays.SIZE
 
 
 @dataclass(frozen=True)
@@ -45,6 +54,16 @@ class Case:
 
     def jet(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
         return tetrahedral_oracle.reconstruct(self.name, self.samples, points, self.boundary, self.prefilter)
+
+    @property
+    def size(self) -> np.ndarray:
+        return np.array(self.samples.shape[::-1])
+
+    def truth(self, rays: Rays, close: float = 1e-11) -> list[Truth]:
+        return crossings(self.polynomials, *rays, self.level, close)
+
+    def gradient(self, points: np.ndarray) -> np.ndarray:
+        return self.jet(points)[1]
 
 
 # ---- what level sets are of
@@ -76,37 +95,6 @@ def of_a_vertex(rng: np.random.Generator, name: str, boundary: str, prefilter: b
 
 
 # ---- rays, in voxel coordinates
-
-
-def random(rng: np.random.Generator, _: Case, rays: int) -> Rays:
-    origins = rng.normal(size=(rays, 3)) * 10 + SIZE / 2
-    return origins, (rng.uniform(0, 1, (rays, 3)) * SIZE - origins) * rng.uniform(0.1, 10, (rays, 1))
-
-
-def axis_parallel(rng: np.random.Generator, _: Case, rays: int) -> Rays:
-    origins, axis = rng.uniform(-0.4, 1, (rays, 3)) * (SIZE - 1), np.arange(rays) % 3
-    some = rng.random((rays, 3)) < 0.3
-    origins[some] = (rng.integers(0, 4 * SIZE, (rays, 3)) / 4)[some]
-    sign = rng.choice([-1.0, 1.0], rays)
-    origins[np.arange(rays), axis] -= sign * 12
-    return origins, np.eye(3)[axis] * sign[:, None]
-
-
-def in_last_faces(rng: np.random.Generator, case: Case, rays: int) -> Rays:
-    """Across one axis, at the upper end of the domain."""
-    origins, directions = random(rng, case, rays)
-    ray, axis = np.arange(rays), np.arange(rays) % 3
-    origins[ray, axis], directions[ray, axis] = (SIZE - 0.5)[axis], 0
-    return origins, directions
-
-
-def inside_out(rng: np.random.Generator, _: Case, rays: int) -> Rays:
-    return rng.uniform(-0.5, 0.5, (rays, 3)) + rng.uniform(0, 1, (rays, 3)) * (SIZE - 1), rng.normal(size=(rays, 3))
-
-
-def from_far(rng: np.random.Generator, case: Case, rays: int) -> Rays:
-    origins, directions = random(rng, case, rays)
-    return origins - 1e6 * directions / np.linalg.norm(directions, axis=1, keepdims=True), directions
 
 
 def _tetrahedra(rng: np.random.Generator, rays: int) -> np.ndarray:
@@ -159,22 +147,6 @@ def _aimed(rng: np.random.Generator, target: np.ndarray, rays: int) -> Rays:
     return target - 16 * directions, directions
 
 
-def grazing(rng: np.random.Generator, case: Case, rays: int) -> Rays:
-    """Tangent to the level set where random rays hit it, and 1e-9 … 1e-2 off to either side."""
-    origins, directions = random(rng, case, 3 * rays)
-    truth = crossings(case.polynomials, origins, directions, case.level)
-    hit = np.array([ray for ray, one in enumerate(truth) if len(one.t)], dtype=int)[:rays]
-    t = np.array([truth[ray].t[0] for ray in hit]).reshape(-1, 1)
-    points = origins[hit] + t * directions[hit]
-    if not len(hit):
-        return origins[:0], directions[:0]
-    gradient = case.jet(points)[1]
-    normal = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-300)
-    along = np.cross(normal, rng.normal(size=normal.shape))
-    off = rng.choice([-1.0, 1.0], (len(hit), 1)) * 10 ** rng.uniform(-9, -2, (len(hit), 1))
-    return points + off * normal - 16 * along, along
-
-
 Make = Callable[[np.random.Generator, Case, int], Rays]
 Of = Callable[[np.random.Generator, str, str, bool], Case]
 CLASSES: dict[str, tuple[Of, Make]] = {
@@ -197,38 +169,13 @@ CLASSES: dict[str, tuple[Of, Make]] = {
 
 def judged(case: Case, rays: Rays, far: bool = False, device: str = "cpu", **chosen: object) -> Counter[str]:
     """First hits and all hits of filterlab on rays: what is missed, invented, later than it is, out of place."""
-    origins, directions = rays
-    truth = crossings(case.polynomials, origins, directions, case.level, 3e-8 if far else 1e-11)
     options = {"boundary": case.boundary, "prefilter": case.prefilter, **chosen}
-    volume, o, d = (torch.from_numpy(x).to(device) for x in (case.samples, *rays))
+    volume = torch.from_numpy(case.samples).to(device)
     surface = LevelSet(fl.reconstruct(volume, case.name, **options), case.level)  # type: ignore
-    first, every = surface.hit(o, d).t.cpu().numpy(), surface.hits(o, d, SHEETS).t.cpu().numpy()
-    tolerance = (1e-6 if far else 1e-8) / np.linalg.norm(directions, axis=1)
-    found = Counter(of_first(truth, first, tolerance))
-    found.update({f"sheets {key}": n for key, n in ray_oracle.judged(truth, every, tolerance).items()})
-    return found
+    return level_set_rays.judged(case.truth(rays, 3e-8 if far else 1e-11), surface, rays, far)
 
 
-def of_first(truth: list[ray_oracle.Truth], t: np.ndarray, tolerance: np.ndarray) -> dict[str, int]:
-    """Of first hits t (R,), ∞ where there is none; one that is earlier than all crossings is invented."""
-    decided = np.array([one.undecided == np.inf for one in truth], dtype=bool)
-    expected = np.array([one.t[0] if len(one.t) else np.inf for one in truth])
-    with np.errstate(invalid="ignore"):
-        apart = np.where(t == expected, 0, t - expected)
-    return {
-        "rays": len(truth),
-        "undecided": int((~decided).sum()),
-        "hits": int((decided & (expected < np.inf)).sum()),
-        "missed": int((decided & (t == np.inf) & (expected < np.inf)).sum()),
-        "invented": int((decided & (apart < -tolerance)).sum()),
-        "later": int((decided & (apart > tolerance) & (t < np.inf)).sum()),
-    }
-
-
-FAULTS = ("missed", "invented", "later", "sheets missed", "sheets invented", "sheets misplaced")
-
-
-def one(name: str, boundary: str, prefilter: bool, kind: str, rays: int, seed: int, **chosen: object) -> Counter[str]:
+def one(name: str, kind: str, boundary: str, prefilter: bool, rays: int, seed: int, **chosen: object) -> Counter[str]:
     """Rays of one class."""
     rng = np.random.default_rng(seed)
     of, make = CLASSES[kind]
@@ -239,19 +186,14 @@ def one(name: str, boundary: str, prefilter: bool, kind: str, rays: int, seed: i
 def campaign(seconds: float, rays: int = 1000, first: int = 0, **chosen: object) -> dict[tuple[str, str], Counter[str]]:
     """All splines, boundaries and classes, with and without prefilter, in turn, seed after seed until time is up.
 
-    What has a fault is printed as it is found: the arguments of `one`. A device is chosen, options go to `reconstruct`.
+    A device is chosen, options go to `reconstruct`.
     """
-    found: dict[tuple[str, str], Counter[str]] = {}
-    begin = time.perf_counter()
-    for seed in count(first):
-        for name, kind, boundary, prefilter in product(SPLINES, CLASSES, BOUNDARIES, (True, False)):
-            if time.perf_counter() - begin > seconds:
-                return found
-            verdict = one(name, boundary, prefilter, kind, rays, seed, **chosen)
-            found.setdefault((name, kind), Counter()).update(verdict)
-            if any(verdict[fault] for fault in FAULTS):
-                print((name, boundary, prefilter, kind, rays, seed), dict(verdict), flush=True)
-    raise AssertionError
+
+    def sweep(seed: int) -> Iterator[tuple]:
+        for given in product(SPLINES, CLASSES, BOUNDARIES, (True, False)):
+            yield *given, rays, seed
+
+    return level_set_rays.in_turn(seconds, first, sweep, partial(one, **chosen))
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from benchmarks.records import at_most
 from benchmarks.settings import Settings
 from filterlab.names import SPLINES
 from filterlab.ops.differentiable import height_hits
+from filterlab.ops.differentiable import heights as jets
 from filterlab.render import PerspectiveCamera
 from filterlab.surfaces import HeightField
 
@@ -168,12 +169,38 @@ def _growth(settings: Settings) -> Race:
     return Race(f"c1, {contestants[0].samples:,} rays: first hits by the size of the grid", contestants, ratios)
 
 
+def _jets(settings: Settings, transposed: bool) -> Race:
+    """Points that lie all over the grid, in no order."""
+    heights, count = hills(size_of(settings)), settings.points // 5
+    points = torch.rand(1, count, 2, generator=torch.Generator().manual_seed(1)) * (len(heights) - 1)
+    cotangents = torch.rand(1, 3, count, generator=torch.Generator().manual_seed(2)) - 0.5
+    contestants, ratios = [], []
+    for spline in SPLINES:
+        values = heights.clone().requires_grad_(transposed)
+        described = HeightField(values, spline)._described
+        for name, how in (("fused", "cpu"), ("plain", "reference")):
+            if transposed:
+                jet = jets.jet(described, points, 1, how)
+                call: Callable[[], Any] = partial(torch.autograd.grad, jet, values, cotangents, retain_graph=True)
+                shown = lambda found: (found[0],)  # noqa: E731
+            else:
+                call = partial(jets.jet, described, points, 1, how)
+                shown = lambda rows: (rows[0, 0], rows[0, 1:])  # noqa: E731
+            contestants.append(Contestant(f"{spline}, {name}", call, spline, shown, count))
+        ratios.append(Ratio(f"{spline}, fused", f"{spline}, plain", at_most("1/30")))
+    kind = "the transpose of jets" if transposed else "jets"
+    what = f"{len(heights)}² data, {count:,} points in no order: {kind} of order 1, fused and in plain torch"
+    return Race(what, contestants, ratios, tolerance=1e-3)
+
+
 def _items(settings: Settings) -> list[Item]:
     return [
         race_item("first", 30, _first),
         race_item("equal-error", 30, _equal_error),
         race_item("plain", 60, _plain),
         race_item("size", 10, _growth),
+        race_item("scattered", 20, partial(_jets, transposed=False)),
+        race_item("scattered-transpose", 20, partial(_jets, transposed=True)),
     ]
 
 

@@ -42,6 +42,12 @@ class Term:
     kernels: tuple[PiecewisePolynomial, PiecewisePolynomial, PiecewisePolynomial]
 
 
+Axes = tuple[bool, bool, bool]
+"""Which of x, y, z."""
+
+NO_AXIS: Axes = (False, False, False)
+
+
 class Scheme(Protocol):
     """How the sum over coefficients is computed.
 
@@ -52,7 +58,9 @@ class Scheme(Protocol):
         reach: coefficients needed on each side of a point's cell.
         terms: the value as a sum of separable terms (what `resample` uses).
         exact: whether the value is that sum but for rounding: not where a texture unit's fractions are modelled.
-        single: the axes x, y, z of which one coefficient is enough.
+        single: the axes x, y, z of one voxel that goes on as it is: along them all coefficients are the same.
+        around: how many of these are kept on each side of the one; 0: that one is enough.
+        period: by how many coefficients points may be moved for the same field, moved.
     """
 
     @property
@@ -68,7 +76,11 @@ class Scheme(Protocol):
     @property
     def exact(self) -> bool: ...
     @property
-    def single(self) -> tuple[bool, bool, bool]: ...
+    def single(self) -> Axes: ...
+    @property
+    def around(self) -> int: ...
+    @property
+    def period(self) -> int: ...
 
     def evaluation(self, coefficients: Coefficients, placement: Placement, order: int) -> Evaluation:
         """What gives the jet of that order of coefficients (N, C, D', H', W'); all that no point changes is settled.
@@ -98,8 +110,8 @@ class Coefficients:
     Attributes:
         values: (..., D', H', W'); (N, C, D', H', W') where a scheme reads them.
         start: the first coefficient lies at start + shift in voxel coordinates, the same along every axis.
-        shift: along x, y, z: 0, ½ for coefficients at half-integers (the notch), or, along an axis of one coefficient,
-            what brings it to where the points are.
+        shift: along x, y, z: 0, ½ for coefficients at half-integers (the notch), or, along an axis of one voxel, what
+            brings its coefficients to where the points are.
         size: voxels of the volume along x, y, z.
         boundary: the extension of the samples.
         tail: how far beyond the ends points are told apart (border and zeros); the extension is constant beyond.
@@ -124,17 +136,20 @@ class Coefficients:
         factor: Factor | None = None,
         storage: torch.dtype | None = None,
         unknown: Tensor | None = None,
-        single: tuple[bool, bool, bool] = (False, False, False),
+        single: Axes = NO_AXIS,
+        around: int = 0,
+        period: int = 1,
     ) -> Coefficients:
         """Prefilter, extend by the boundary, apply the discrete part of a factored kernel, and store.
 
-        Along the axes x, y, z that are `single` nothing is done: their one sample is the coefficient everywhere.
+        Along the axes x, y, z that are `single` nothing is done: their one sample is the coefficient everywhere, and is
+        kept `around` times on each side, and as often more before it as moves points by a multiple of `period`.
 
         Where `unknown`, a mask of the samples, coefficients are NaN: after the prefilter, which would spread them.
 
         Memory: (n + 2·pad)³ coefficients, pad = reach (+1 for a factored kernel) under mirror, reflect and wrap;
-        under border and zeros 2·reach plus the prefilter's decay (about 10 … 50 voxels, see `Prefilter.decay`); 1 along
-        an axis that is `single`.
+        under border and zeros 2·reach plus the prefilter's decay (about 10 … 50 voxels, see `Prefilter.decay`); along
+        an axis that is `single` 1 + 2·around, or as many and period − 1.
         """
         reach = reach if factor is None else reach + 1
         decay = 0 if boundary.periodic else prefilter.decay(torch.promote_types(samples.dtype, torch.float32))
@@ -152,10 +167,19 @@ class Coefficients:
         shift = 0.0
         if factor is not None:
             values, shift = _apply_factor(values, dims, factor), 0.5
+        before = around + (-start - around) % period
+        for dim in (dim for dim in VOLUME if single[-1 - dim]):
+            values = boundary.extend(values, dim, before, around)
         values, quantization = stored_as(values, storage)
         d, h, w = samples.shape[-3:]
-        x, y, z = (-start if alone else shift for alone in single)
+        x, y, z = (-before - start if alone else shift for alone in single)
         return cls(values, start, (x, y, z), (w, h, d), boundary, tail, quantization)
+
+    @property
+    def first(self) -> tuple[float, float, float]:
+        """Where the first coefficient lies along x, y, z, in voxels."""
+        x, y, z = self.shift
+        return self.start + x, self.start + y, self.start + z
 
     def __getitem__(self, index: tuple[int, int]) -> Coefficients:
         """Those of entry n and channel c of a batch."""
@@ -175,7 +199,7 @@ class Coefficients:
         row = tuple(Product(term.kernels, weight=term.weight) for term in terms)
         values, offset = self.values, []
         for axis, (n, support) in enumerate(zip(self.size, Stencil((row,)).supports, strict=True)):
-            zero = self.start + self.shift[axis] + support / 2 - 1  # where the first cell of all begins
+            zero = self.first[axis] + support / 2 - 1  # where the first cell of all begins
             first, last = math.floor(-0.5 - zero), math.ceil(n - 0.5 - zero)
             values = values.narrow(-1 - axis, first, last - first + support - 1)
             offset.append(first + zero)

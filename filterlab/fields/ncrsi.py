@@ -22,7 +22,6 @@ from torch import Tensor
 from filterlab.fields.grid import Coefficients, Term
 from filterlab.fields.tensor_product import (
     Sampled,
-    Sampler,
     along,
     unit_steps,
     with_central_differences,
@@ -40,12 +39,8 @@ NCRSI_TERMS: tuple[Term, ...] = (
 class SevenSamples(Sampled):
     """NCRSI from seven trilinear samples, and central differences from the same seven."""
 
-    sample: Sampler
     terms: tuple[Term, ...] = NCRSI_TERMS
-    name: str = "sampled"
     gradient: str = "central"
-    max_order: int = 1
-    reach: int = 3
 
     @with_exact_positions
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:

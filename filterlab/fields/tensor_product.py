@@ -14,13 +14,13 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property, wraps
 from itertools import chain, product
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import torch
 from torch import Tensor
 
 from filterlab import ops
-from filterlab.fields.grid import Coefficients, Evaluation, Term, implementation_of
+from filterlab.fields.grid import NO_AXIS, Axes, Coefficients, Evaluation, Term, implementation_of
 from filterlab.kernels import CENTRAL_DIFFERENCE, LINEAR, Kernel, PiecewisePolynomial, bspline, horner
 from filterlab.ops import Product, Stencil, multi_indices
 from filterlab.ops.place import Placement
@@ -33,12 +33,17 @@ Sampler = Callable[[Coefficients, Tensor], Tensor]
 The first coefficient, `coefficients.values[..., 0, 0, 0]`, lies at `coefficients.start` along every axis.
 """
 
-_TRILINEAR = Stencil.jet(LINEAR, 0)
+_ALONG = (LINEAR, bspline(0))
+_TRILINEAR = {
+    (x, y, z): Stencil(((Product((_ALONG[x], _ALONG[y], _ALONG[z])),),)) for x, y, z in product((False, True), repeat=3)
+}
+"""By which axes have one coefficient."""
 
 
 def exact_sample(coefficients: Coefficients, points: Tensor) -> Tensor:
-    """Trilinear interpolation in the dtype of the points."""
-    return ops.gather(coefficients.values, points, _TRILINEAR, coefficients.start)[:, :, 0]
+    """Trilinear interpolation in the dtype of the points; along an axis of one coefficient, that."""
+    d, h, w = coefficients.values.shape[-3:]
+    return ops.gather(coefficients.values, points, _TRILINEAR[w == 1, h == 1, d == 1], coefficients.start)[:, :, 0]
 
 
 def texture_unit_sample(coefficients: Coefficients, points: Tensor) -> Tensor:
@@ -92,7 +97,16 @@ def same_kernel(kernel: PiecewisePolynomial) -> tuple[Term, ...]:
     return (Term(1.0, (kernel, kernel, kernel)),)
 
 
-def summed_along(terms: tuple[Term, ...], single: tuple[bool, bool, bool]) -> tuple[Term, ...]:
+def single_axes(terms: tuple[Term, ...], size: Sequence[int], boundary: Boundary) -> Axes:
+    """The axes x, y, z of one voxel that goes on as it is, of sums that are constant along them."""
+    sums = [_sum_over_translates(kernel) for term in terms for kernel in term.kernels]
+    if boundary is Boundary.ZEROS or None in sums:
+        return NO_AXIS
+    x, y, z = (n == 1 for n in size)
+    return x, y, z
+
+
+def summed_along(terms: tuple[Term, ...], single: Axes) -> tuple[Term, ...]:
     """Terms over coefficients that are the same all along some axes: one coefficient serves for the taps of each.
 
     Its weight is Σ_k φ(x − k), which is the same at every x. Terms that differ in nothing else are one.
@@ -141,18 +155,17 @@ class Direct:
     name: str = "direct"
     gradient: str = "analytic"
     exact: bool = True
-    single: tuple[bool, bool, bool] = (False, False, False)
+    single: Axes = NO_AXIS
+    around: int = 0
+    period: int = 1
 
     def __post_init__(self) -> None:
         _ = self.stencils  # made now: torch.compile can't make them while it traces
 
     def along(self, size: Sequence[int], boundary: Boundary) -> Direct:
         """The same of a volume of so many voxels along x, y, z: axes of one that goes on as it is are single."""
-        sums = [_sum_over_translates(kernel) for term in self.terms for kernel in term.kernels]
-        if boundary is Boundary.ZEROS or None in sums:
-            return self
-        x, y, z = (n == 1 for n in size)
-        return replace(self, terms=summed_along(self.terms, (x, y, z)), single=(x, y, z))
+        single = single_axes(self.terms, size, boundary)
+        return replace(self, terms=summed_along(self.terms, single), single=single)
 
     @property
     def max_order(self) -> int:
@@ -182,18 +195,33 @@ class Direct:
         )
 
 
+@dataclass(frozen=True)
 class Sampled(ABC):
-    """A scheme that places points and takes trilinear samples of the coefficients there."""
+    """A scheme that places points and takes trilinear samples of the coefficients there; see `Scheme`."""
 
     sample: Sampler
+    terms: tuple[Term, ...]
+    name: str = "sampled"
+    gradient: str = "analytic"
+    max_order: int = 1
+    reach: int = 3
+    single: Axes = NO_AXIS
+    around: int = 0
+    period: int = 1
+
+    def along(self, size: Sequence[int], boundary: Boundary) -> Self:
+        """The same of a volume of so many voxels along x, y, z: axes of one that goes on as it is are single.
+
+        Not with a sampler of somebody else, who may want two coefficients along every axis.
+        """
+        if self.sample not in SAMPLERS.values():
+            return self
+        single = single_axes(self.terms, size, boundary)
+        return replace(self, terms=summed_along(self.terms, single), single=single)
 
     @property
     def exact(self) -> bool:
         return self.sample is exact_sample
-
-    @property
-    def single(self) -> tuple[bool, bool, bool]:
-        return False, False, False
 
     @abstractmethod
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
@@ -230,11 +258,7 @@ class EightTrilinearQuadratic(Sampled):
     g₁ = ½ + β for the value, by −2 and 2 for the derivative along that axis.
     """
 
-    sample: Sampler
     terms: tuple[Term, ...] = field(default_factory=lambda: same_kernel(bspline(2)))
-    name: str = "sampled"
-    gradient: str = "analytic"
-    max_order: int = 1
     reach: int = 2
 
     @with_exact_positions
@@ -258,12 +282,7 @@ class EightTrilinearCubic(Sampled):
     i − 1 + w₁/g₀ and i + 1 + w₃/g₁ with g₀ = w₀ + w₁, g₁ = w₂ + w₃. Source: Sigg & Hadwiger, GPU Gems 2, chapter 20.
     """
 
-    sample: Sampler
     terms: tuple[Term, ...] = field(default_factory=lambda: same_kernel(bspline(3)))
-    name: str = "sampled"
-    gradient: str = "analytic"
-    max_order: int = 1
-    reach: int = 3
 
     @with_exact_positions
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:
@@ -326,12 +345,8 @@ def _combine(samples: Sequence[Tensor], weights: list[Tensor]) -> Tensor:
 class TrilinearCentral(Sampled):
     """One trilinear sample for the value, six more for central differences: what volume renderers do by default."""
 
-    sample: Sampler
     terms: tuple[Term, ...] = field(default_factory=lambda: same_kernel(LINEAR))
-    name: str = "sampled"
     gradient: str = "central"
-    max_order: int = 1
-    reach: int = 3
 
     @with_exact_positions
     def jet(self, coefficients: Coefficients, points: Tensor, order: int) -> Tensor:

@@ -32,7 +32,7 @@ from torch import Tensor
 
 from filterlab import bernstein, ops
 from filterlab.bernstein import Index, multi_indices
-from filterlab.fields.grid import Coefficients, Evaluation, Term, implementation_of
+from filterlab.fields.grid import NO_AXIS, Axes, Coefficients, Evaluation, Term, implementation_of
 from filterlab.fields.trends import Input, Piece, on_cubes, on_octahedra
 from filterlab.geometry import Geometry
 from filterlab.ops.differentiable.recording import plain, transformed
@@ -460,7 +460,8 @@ class Folding:
         strides = (*strides, strides[1] * sizes[1])
         reach = spline.support + 1
         rows, zero, ends, periods, length = [], [], [], [], 0
-        for n, size, stride in zip(coefficients.size, sizes, strides, strict=True):
+        for n, size, stride, begin in zip(coefficients.size, sizes, strides, coefficients.first, strict=True):
+            first = int(begin)
             if boundary.periodic:
                 periods.append(math.lcm(round(boundary.period(n) or 0), spline.period))
                 low, high = -periods[-1], periods[-1]
@@ -470,9 +471,9 @@ class Folding:
             ends.append((low, high))
             index = torch.arange(low - spline.period - reach, high + spline.period + reach + 1)
             if boundary.periodic:  # what is stored is read as programs read it: it may be rounded otherwise
-                stored = (index >= coefficients.start) & (index < coefficients.start + size)
+                stored = (index >= first) & (index < first + size)
                 index = torch.where(stored, index, boundary.source(index, n))
-            rows.append(stride * (index - coefficients.start).clamp(0, size - 1))
+            rows.append(stride * (index - first).clamp(0, size - 1))
             zero.append(length + reach + spline.period - low)
             length += len(rows[-1])
         return cls(
@@ -534,7 +535,8 @@ class OnTetrahedra:
         spline: what is summed.
         terms: none, the value is not separable.
         exact: not that of the terms.
-        single: no axis; what is constant along one does not give what is.
+        single: the axes of one voxel; what is constant along one gives what is not, as tetrahedra are, so that programs
+            read as many coefficients there as elsewhere.
     """
 
     spline: Spline
@@ -543,11 +545,24 @@ class OnTetrahedra:
     max_order: int = 2
     terms: tuple[Term, ...] = ()
     exact: bool = False
-    single: tuple[bool, bool, bool] = (False, False, False)
+    single: Axes = NO_AXIS
+
+    def along(self, size: Sequence[int], boundary: Boundary) -> OnTetrahedra:
+        """The same of a volume of so many voxels along x, y, z: axes of one that goes on as it is are single."""
+        x, y, z = (n == 1 and boundary is not Boundary.ZEROS for n in size)
+        return replace(self, single=(x, y, z))
 
     @property
     def reach(self) -> int:
         return _BEYOND + max(self.spline.lowered.reach)
+
+    @property
+    def around(self) -> int:
+        return self.reach
+
+    @property
+    def period(self) -> int:
+        return self.spline.period
 
     @cached_property
     def stencils(self) -> tuple[TetrahedralStencil, ...]:

@@ -121,8 +121,8 @@ class FieldOnTetrahedra(GridField):
     def lattice(self) -> TetrahedralLattice:
         """The cubes about the samples; of an unbatched field, padded for programs."""
         spline, values = self.scheme.spline.lowered, self.coefficients.values
-        for dim, n in zip((-1, -2, -3), self.coefficients.size, strict=True):
-            values = values.narrow(dim, -self.coefficients.start - spline.around, n + 2 * spline.around)
+        for dim, n, first in zip((-1, -2, -3), self.coefficients.size, self.coefficients.first, strict=True):
+            values = values.narrow(dim, -int(first) - spline.around, n + 2 * spline.around)
         x, y, z = (float(n) for n in self.coefficients.size)
         quantization = self.coefficients.quantization
         scale, shift = (1.0, 0.0) if quantization is None else quantization.numbers()

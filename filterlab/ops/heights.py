@@ -12,7 +12,7 @@ and their 15 coefficients stand in the order of `filterlab.bernstein`. `ops.refe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import comb, perm
@@ -197,15 +197,13 @@ class Masks:
         kept = [n for n, alpha in enumerate(multi_indices(DEGREE, 2)) if self.degree == DEGREE or DEGREE in alpha]
         self.weights = [pattern.up.weights[n] for n in kept]
 
-    def coefficients(self, data: Sequence[Value]) -> list[Value]:
-        """All of a triangle."""
+    def coefficients(self, data: Iterable[Value]) -> list[Value]:
+        """All of a triangle, datum by datum: none need be kept."""
         e = self.arithmetic
-        found = []
-        for weights in self.weights:
-            total = None
-            for weight, datum in zip(weights, data, strict=True):
-                total = e.multiply_add(datum, e.constant(weight), total) if weight else total
-            found.append(total)
+        found: list[Value] = [None] * len(self.weights)
+        for datum, column in zip(data, zip(*self.weights, strict=True), strict=True):
+            for n, weight in enumerate(column):
+                found[n] = e.multiply_add(datum, e.constant(weight), found[n]) if weight else found[n]
         return found
 
     def derivatives(self, coefficients: list[Value], barycentric: Sequence[Value], order: int) -> list[Value]:

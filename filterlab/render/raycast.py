@@ -78,9 +78,11 @@ class Casting:
     def eye(self, seen: PixelRays, channels: Sequence[str]) -> Eye:
         """The same, for finding edges in those channels; in float64, or both sides of one would be the same ray."""
         exact = replace(self, dtype=torch.float64)
-        counting = replace(exact, surface=self.surface.detached, sheets=COUNTED)  # nothing is recorded of a search
+        searching = replace(exact, surface=self.surface.detached)  # nothing is recorded of a search
+        counting = replace(searching, sheets=COUNTED)
+        watching = searching if self.sheets == 1 else counting
         radiance = lambda o, d: exact(o, d, channels)  # noqa: E731
-        return Eye(self.surface, self.region, seen.rays, counting._hits, radiance)
+        return Eye(self.surface, self.region, seen.rays, counting._hits, watching._hits, radiance)
 
     def _hits(self, inside: Spans) -> Hits:
         """Those within the spans: t (R, k) from where rays enter."""

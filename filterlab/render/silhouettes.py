@@ -10,8 +10,9 @@ beside what the hits' own derivatives give. Points of edges are found on lines t
 counted with the inverse of how often such lines meet them there: ½ (|m_u| + |m_v|) / |∇m| for each unit of length, so
 that a line that touches an edge counts no more than another.
 
-A line is cut into parts, and these are cut on where rays at both ends have other hits: another number of them, or one
-elsewhere among as many, since there an edge takes what the next one gives, as where one lump covers another.
+A line is cut into parts, and these are cut on where rays at both ends see other hits: another number of them, or one
+elsewhere among as many, as where one lump covers another. Of what is opaque the first hit is seen; all hits of a ray
+are found but on both sides of the edges that are left, to tell which of them vanish.
 
 What m is says the ray on the edge. With F = 0 the surface (`surfaces.base`), o + t d the ray:
 
@@ -44,6 +45,9 @@ from filterlab.surfaces.base import Hits, Surface
 COUNTED = 64
 """Hits of a ray that are told apart: edges behind the last are not seen."""
 
+_FINER = (
+    8  # times as many parts of lines where but one hit of a ray is looked at, which is found sooner, and tells less
+)
 _CUT, _ROUNDS = 8, 10  # parts that what an edge lies in is cut into, and how often: L is that of 8⁻¹⁰ of it away
 _APART, _STEEP = 0.125, 1  # voxels, and times how far rays are apart, by which hits differ if there is an edge between
 _AT_FACE = 1e-4  # of the domain's diagonal: a hit that vanishes farther from a face is none that left through it
@@ -58,7 +62,8 @@ class Silhouettes:
     Attributes:
         lines: through every pixel, each across or down at a place that is drawn; more of them make derivatives less
             noisy, and change nothing of what is expected.
-        parts: of each line, at whose ends hits are compared: what comes and goes again within one is not seen.
+        parts: of each line, at whose ends hits are compared: what comes and goes again within one is not seen. Those of
+            opaque surfaces are cut into eight.
 
     Raises:
         ValueError: not two integers from 1 to 64.
@@ -81,6 +86,7 @@ class Eye:
         surface, region: as of `raycast`.
         rays: those of some pixels, through a place within each.
         hits: (R, `COUNTED`) of spans of rays, in order, from where they enter.
+        seen: (R, S) those that the image shows.
         radiance: (R, width) of rays: what jumps.
     """
 
@@ -88,6 +94,7 @@ class Eye:
     region: Region | None
     rays: Callable[[Tensor, Place], tuple[Tensor, Tensor]]
     hits: Callable[[Spans], Hits]
+    seen: Callable[[Spans], Hits]
     radiance: Callable[[Tensor, Tensor], Tensor]
 
     def spans(self, lines: _Lines, x: Tensor) -> Spans:
@@ -98,6 +105,10 @@ class Eye:
     def sheets(self, lines: _Lines, x: Tensor) -> Tensor:
         """t of their hits (Q, `COUNTED`)."""
         return self.hits(self.spans(lines, x)).t
+
+    def shown(self, lines: _Lines, x: Tensor) -> Tensor:
+        """t of those of their hits that the image shows (Q, S)."""
+        return self.seen(self.spans(lines, x)).t
 
     def apart(self, stretches: _Stretches) -> Tensor:
         """How far from each other (Q,) rays at both ends of stretches pass the middle of the domain."""
@@ -143,7 +154,7 @@ class _Stretches(NamedTuple):
 
     Attributes:
         low, high: (Q,) x of their ends.
-        before, behind: (Q, `COUNTED`) hits there.
+        before, behind: (Q, S) hits there.
     """
 
     lines: _Lines
@@ -200,10 +211,14 @@ def swept(how: Silhouettes, eye: Eye, pixels: Tensor, seed: int) -> Tensor:
 def _found(eye: Eye, lines: _Lines, parts: int) -> _Edges:
     """In parts of lines, those are cut on at whose ends hits are others, until but edges are left."""
     ends = [torch.full_like(lines.beside, x) for x in (0.0, 1.0)]
-    stretches = _cut(eye, _Stretches(lines, *ends, *(eye.sheets(lines, x) for x in ends)), parts)
+    whole = _Stretches(lines, *ends, *(eye.shown(lines, x) for x in ends))
+    stretches = _cut(eye, whole, parts if whole.before.shape[1] > 1 else _FINER * parts)
     for _ in range(_ROUNDS):
         stretches = _cut(eye, stretches, _CUT)
-    return _classified(eye, stretches.some(_count(stretches.before) != _count(stretches.behind)))
+    twice = _Lines(*(torch.cat((field, field)) for field in stretches.lines))
+    before, behind = eye.sheets(twice, torch.cat(stretches[1:3])).chunk(2)
+    stretches = stretches._replace(before=before, behind=behind)
+    return _classified(eye, stretches.some(_count(before) != _count(behind)))
 
 
 def _cut(eye: Eye, stretches: _Stretches, parts: int) -> _Stretches:
@@ -212,11 +227,12 @@ def _cut(eye: Eye, stretches: _Stretches, parts: int) -> _Stretches:
     inner = torch.arange(1, parts, dtype=low.dtype, device=low.device) / parts
     each = torch.arange(len(low), device=low.device).repeat_interleave(parts - 1)
     between = torch.lerp(low[:, None], high[:, None], inner)
-    hits = eye.sheets(lines.some(each), between.flatten()).view(len(low), parts - 1, COUNTED)
+    hits = eye.shown(lines.some(each), between.flatten()).view(len(low), parts - 1, before.shape[1])
     x, hits = (
         torch.cat(row, 1) for row in ((low[:, None], between, high[:, None]), (before[:, None], hits, behind[:, None]))
     )
-    slack = torch.clamp(_STEEP * eye.apart(stretches) / parts, min=_APART * eye.surface.domain.voxel_size)
+    least = _APART / (_FINER if before.shape[1] == 1 else 1) * eye.surface.domain.voxel_size
+    slack = torch.clamp(_STEEP * eye.apart(stretches) / parts, min=least)
     row, part = _differ(hits[:, :-1], hits[:, 1:], slack[:, None]).nonzero().unbind(-1)
     return _Stretches(lines.some(row), x[row, part], x[row, part + 1], hits[row, part], hits[row, part + 1])
 

@@ -86,7 +86,7 @@ fuzzing.main(sys.argv[1], *map(int, sys.argv[2:5]), *sys.argv[5:])
 """
 
 
-def test_what_goes_wrong_is_found(monkeypatch):
+def test_what_goes_wrong_is_found(forks, monkeypatch):
     monkeypatch.setattr(fuzzing, "_TOLD_EVERY", 5)
     found = fuzzed("damaged", 30, 1, (sys.executable, "-c", BROKEN))
     expected = [
@@ -106,7 +106,7 @@ def test_what_goes_wrong_is_found(monkeypatch):
     assert found.cases == 20  # of two times five nothing is known
 
 
-def test_a_process_that_tells_nothing_is_ended(monkeypatch):
+def test_a_process_that_tells_nothing_is_ended(forks, monkeypatch):
     monkeypatch.setattr(fuzzing, "_SILENCE", 1.0)
     monkeypatch.setattr(fuzzing, "_TOLD_EVERY", 10)
     found = fuzzed("damaged", 10, 1, (sys.executable, "-c", "import time; time.sleep(60)"))

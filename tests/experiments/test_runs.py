@@ -62,7 +62,7 @@ def count_slowly(journal, seconds):
 
 
 @pytest.fixture
-def slow(tmp_path, command, monkeypatch, capsys):
+def slow(tmp_path, forks, command, monkeypatch, capsys):
     """A process that counts, and what goes on with its run in this process: None -> what was told."""
     path = tmp_path / "slow.yaml"
     path.write_text("experiment: counting\ndescription: counts slowly\ncount: 30\n")

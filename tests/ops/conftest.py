@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.ops.interpreter import hasten
+
 
 @pytest.fixture(params=["interpreter", "gpu"])
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory):
@@ -14,6 +16,8 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_
         pytest.skip("no GPU that torch can use")
     monkeypatch.setenv("TRITON_INTERPRET", str(int(request.param == "interpreter")))
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "triton"))
+    if request.param == "interpreter":
+        hasten(monkeypatch)
     with np.errstate(all="ignore"):
         yield "cpu" if request.param == "interpreter" else "cuda"
 

@@ -46,7 +46,7 @@ def test_operators_have_the_derivatives_of_the_functions(implementation: str) ->
         ),
         "place": lambda c, p: compiled.place(9 * p, compiled.placement_text(PLACE), implementation)[0] + c.mean(),
     }.items():
-        assert torch.autograd.gradcheck(function, (coefficients, points)), name
+        assert torch.autograd.gradcheck(function, (coefficients, points), fast_mode=implementation == "reference"), name
     ours = ops.gather(coefficients, points, QUADRATIC, 0, implementation)
     assert torch.equal(ours, compiled.gather(coefficients, points, text, 0, implementation))
 

@@ -438,7 +438,7 @@ print(value())
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is mapped without being reserved on Linux only")
-def test_a_program_is_loaded_where_its_parts_lie_far_apart(folder: Path) -> None:
+def test_a_program_is_loaded_where_its_parts_lie_far_apart(folder: Path, forks: None) -> None:
     """One page of room above 3 GiB that are taken, the rest below: once this ended the process."""
     once = PROGRAM.replace("print(", "value = lambda: (")
     done = subprocess.run([sys.executable, "-c", once + FAR_APART], capture_output=True, text=True)
@@ -447,7 +447,7 @@ def test_a_program_is_loaded_where_its_parts_lie_far_apart(folder: Path) -> None
     assert first == again
 
 
-def test_two_processes_at_once(folder: Path) -> None:
+def test_two_processes_at_once(folder: Path, forks: None) -> None:
     command = [sys.executable, "-c", PROGRAM]
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     (first, errors), (second, other_errors) = (process.communicate() for process in both)

@@ -117,9 +117,9 @@ print("the march touched nothing outside")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="guard pages are made with mprotect")
-def test_nothing_outside_the_arrays_is_touched() -> None:
+def test_nothing_outside_the_arrays_is_touched(forks: None) -> None:
     result = subprocess.run(
-        [sys.executable, "-uc", GUARDED + POINTS + MARCH],
+        [sys.executable, "-c", GUARDED + POINTS + MARCH],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,

@@ -15,9 +15,10 @@ from filterlab.ops.cuda import raycast as cuda
 from filterlab.ops.differentiable import raycast
 from filterlab.surfaces import LevelSet
 from tests import tetrahedral_rays
+from tests.level_set_rays import FAULTS
 from tests.ops.test_raycast import AFFINE, samples
 from tests.tetrahedral_oracle import SPLINES
-from tests.tetrahedral_rays import CLASSES, FAULTS, Case, Rays, judged, of_a_vertex
+from tests.tetrahedral_rays import CLASSES, Case, Rays, judged, of_a_vertex
 
 every_spline = pytest.mark.parametrize("name", SPLINES)
 OF_EACH = {"qss": ("wrap", [3, 2, 3]), "cubic-c1": ("border", [3, 2, 2]), "quadratic-c1": ("reflect", [2, 2, 2])}

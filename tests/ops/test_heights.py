@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from filterlab.ops import cpu
+from filterlab.ops.cpu import heights as cpu_heights
+from filterlab.ops.cpu import order as cpu_order
 from filterlab.ops.cpu import threads
 from filterlab.ops.differentiable import heights as ops
 from filterlab.ops.heights import DIAGONALS, Heights, differences, raised, rows
@@ -174,6 +176,41 @@ def test_threads_change_nothing_but_the_order_of_sums(monkeypatch: pytest.Monkey
     assert seen == [3, 3]
     assert torch.equal(alone[0], together[0])
     close(alone[1], together[1], 1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_scattered_points_are_asked_for_and_sorted_without_a_bit_of_difference(monkeypatch, dtype):
+    """Beyond the grid and nowhere too; transposes to rounding, for sums have another order."""
+    values = random(2, 40, 50, dtype=dtype)
+    points = places(2, 1000, 120.0).to(dtype)
+    points[0, 3], points[1, 7, 1] = torch.nan, torch.inf
+    heights, cotangents = given(SPLINES["c1"], values, Boundary.ZEROS), random(2, 3, 1000, seed=5, dtype=dtype) - 0.5
+    monkeypatch.setattr(cpu_heights, "_EDGE", 8)
+    monkeypatch.setattr(cpu_order, "POINTS_AT_ONCE", 600)
+    found = []
+    for asked, sorted_ in ((False, False), (True, False), (True, True)):
+        monkeypatch.setattr(cpu_heights, "_scattered", lambda *_, asked=asked: asked)
+        monkeypatch.setattr(cpu_heights, "_sorting_pays", lambda *_, own=sorted_: own)
+        found.append((cpu_heights.jet(heights, points, 2), cpu_heights.splat(heights, points, cotangents, 1)))
+    (jet, splat), *others = found
+    for own, spread in others:
+        assert torch.equal(own.nan_to_num(7), jet.nan_to_num(7))
+        close(spread, splat, 1e-4 if dtype is torch.float32 else 1e-12)
+    assert int(jet[:, 0].isnan().sum()) == 2
+
+
+def test_which_points_are_sorted():
+    """Many of a large grid that lie all over it, where patches need many data."""
+    values, many = torch.zeros(1, 800, 800), 1 << 16
+    points = places(1, many, 800.0).float()
+    ask = lambda spline, values, points: cpu_heights._sorting_pays(given(spline, values), values, points)  # noqa: E731
+    assert ask(SPLINES["c1"], values, points)
+    assert not ask(SPLINES["linear"], values, points)
+    assert not ask(SPLINES["c1"], values[:, :600], points)
+    assert not ask(SPLINES["c1"], values, points[:, 1:])
+    assert not ask(SPLINES["c1"], values, points.sort(1).values)
+    assert cpu_heights._scattered(given(SPLINES["linear"], values), values, points)
+    assert not cpu_heights._scattered(given(SPLINES["linear"], values), values, points.sort(1).values)
 
 
 def test_what_runs_it():

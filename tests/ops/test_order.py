@@ -66,7 +66,7 @@ def test_stored_coefficients_and_strided_points(sorting, stored: torch.dtype) ->
 def test_sorted_by_bricks_and_stable() -> None:
     points = torch.rand(5000, 3) * torch.tensor([50.0, 33, 40])
     index = torch.arange(5000.0)
-    ordered = order.Sorted(points, SHAPE, 0, 8)
+    ordered = order.Sorted(points, order.Bricks.of(SHAPE[::-1], (0,) * 3, (1,) * 3), 8)
     rows = torch.empty(1, 5000)
     ordered.arrange(index[None], rows)
     assert torch.equal(points[rows[0].long()], ordered.points)
@@ -81,7 +81,7 @@ def test_sorted_by_bricks_and_stable() -> None:
 def test_bricks_grow_until_there_are_few_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(order, "_MOST_BRICKS", 60)
     points = torch.rand(100, 3) * torch.tensor([50.0, 33, 40])
-    ordered = order.Sorted(points, SHAPE, 0, 8)
+    ordered = order.Sorted(points, order.Bricks.of(SHAPE[::-1], (0,) * 3, (1,) * 3), 8)
     assert 0 < len(ordered._begin) <= 60
     assert np.array_equal(np.sort(ordered.points.numpy(), axis=0), np.sort(points.numpy(), axis=0))
 

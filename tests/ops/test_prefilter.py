@@ -229,7 +229,7 @@ print("nothing outside was touched")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="guard pages are made with mprotect")
-def test_nothing_outside_the_arrays_is_touched() -> None:
+def test_nothing_outside_the_arrays_is_touched(forks: None) -> None:
     result = subprocess.run(
         [sys.executable, "-c", GUARDED], env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True
     )
@@ -279,7 +279,7 @@ def test_derivatives_of_first_and_second_order(name: str, tail: int, boundary: B
         return prefilter_samples(x, name, boundary, tail, "cpu") ** 2
 
     assert torch.autograd.gradcheck(squared, (x,), check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(squared, (x,))
+    assert torch.autograd.gradgradcheck(squared, (x,), fast_mode=tail > 0)
 
 
 @every_boundary

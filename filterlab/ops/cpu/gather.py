@@ -19,7 +19,7 @@ from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.job import AXES, Function
 from filterlab.ops.cpu.machine import CHUNKS_PER_THREAD, MOST_POINTS, lanes_of, threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh, zeros
-from filterlab.ops.cpu.order import Sorted
+from filterlab.ops.cpu.order import Bricks, Sorted
 from filterlab.ops.cpu.place import Placing
 from filterlab.ops.cpu.points import BLOCK, PointsJob, PointsVariant
 from filterlab.ops.gather import STORAGE, readable
@@ -149,13 +149,8 @@ def sorting_may_pay(count: int, bytes_of_channel: int) -> bool:
 
 
 def _in_order(points: Tensor, shape: Sequence[int], start: int) -> Iterator[tuple[int, slice, Sorted]]:
-    """(batch entry, which of its points, those points sorted), part by part, so that copies stay bounded."""
-    count = points.shape[1]
-    parts = -(-count // order.POINTS_AT_ONCE)
-    for entry, own in enumerate(points):
-        for i in range(parts):
-            part = slice(count * i // parts, count * (i + 1) // parts)
-            yield entry, part, Sorted(own[part], (shape[2], shape[3], shape[4]), start, lanes_of(points.dtype))
+    """Points (N, M, 3) of coefficients (…, D, H, W), as `order.in_order` gives them."""
+    return order.in_order(points, Bricks.of(shape[:-4:-1], (start,) * 3, (1,) * 3))
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
 """The programs of splines of heights: the rows of a jet at points, and their transpose, added up in heights.
 
-P points at a time. Where they are is found in float64, everything else in the arithmetic of the points; each reads the
-data of its own triangle, number by number, by tables that say where the column and the row of an index are stored under
-the boundary. A half turn maps the triangles of a cell onto one another, so in each lane the data are V0 + σ (a, b),
-with signs σ of its own, and all arithmetic is that of one triangle: the sums of `ops.reference.heights`, masks without
-their zeros.
+P points are a pack. Where they are is found in float64, everything else in the arithmetic of the points; each reads the
+data of its own triangle (`ops.cpu.height_data`). A half turn maps the triangles of a cell onto one another, so in each
+lane the data are V0 + σ (a, b), with signs σ of its own, and all arithmetic is that of one triangle: the sums of
+`ops.reference.heights`, masks without their zeros. Some packs are located before the first of them is summed, so that
+memory can be asked for their data.
 """
 
 from __future__ import annotations
@@ -16,8 +16,11 @@ from dataclasses import dataclass
 from llvmlite import ir
 
 from filterlab.ops.cpu import frame, job
-from filterlab.ops.cpu.lanes import I32, I64, STORAGE, Lanes, Value
+from filterlab.ops.cpu.height_data import Data
+from filterlab.ops.cpu.lanes import DOUBLE, I32, I64, STORAGE, Lanes, Value
 from filterlab.ops.heights import Masks, Pattern, rows
+
+BLOCK = 2  # packs that are located before the first of them is summed
 
 # Strides are in numbers.
 FIELDS: dict[str, type] = {
@@ -36,6 +39,8 @@ FIELDS: dict[str, type] = {
     **{f"{name}_{axis}": ctypes.c_double for name in ("origin", "step") for axis in "xy"},  # of cells
     **{f"{name}_{axis}": ctypes.c_double for name in ("low", "high") for axis in "xy"},  # of a cell's first datum
     **{f"size_{axis}": ctypes.c_int64 for axis in "xy"},  # W, H
+    "row_step": ctypes.c_int64,  # from one row of heights to the next
+    "asked": ctypes.c_int64,  # whether memory is asked for data before they are read
 }
 
 
@@ -79,16 +84,14 @@ class _Located:
     """P points.
 
     Attributes:
-        barycentric: λ.
-        signs: σ along columns and rows, 32-bit integers.
+        local: λ1, λ2.
         start: (column, row) of V0, 32-bit integers.
-        known: a mask: whether both coordinates are finite.
+        signs: σ along columns and rows, 32-bit integers.
     """
 
-    barycentric: list[Value]
-    signs: list[Value]
+    local: list[Value]
     start: list[Value]
-    known: Value
+    signs: list[Value]
 
 
 class _Program:
@@ -100,6 +103,11 @@ class _Program:
         self.storage, self.rows = STORAGE[variant.storage], rows(variant.order)
         self.job = frame.load_job(self.lanes, function.args[0], FIELDS)
         self.masks = Masks(self.lanes, variant.pattern)
+        self.data = Data(self.lanes, self.job, variant.pattern, self.storage, variant.zeros, BLOCK)
+        self.local = self.lanes.reserve(self.lanes.number, 2 * BLOCK * variant.lanes)
+        self.down = self.lanes.reserve(I32, BLOCK * variant.lanes)
+        steps = (getattr(self.job, f"step_{axis}") for axis in "xy")
+        self.per_step = [self.wide.everywhere(self.wide.divide(DOUBLE(1), step)) for step in steps]
 
     def write(self) -> None:
         e, b, j = self.lanes, self.builder, self.job
@@ -110,23 +118,54 @@ class _Program:
             points = e.advance(j.points, b.mul(entry, j.points_entry), e.number)
             own_rows = e.advance(j.rows, e.product(entry, I64(len(self.rows)), j.count), e.number)
             values = e.advance(j.values, b.mul(entry, j.values_entry), self.storage.raw)
-            with e.repeat(first, e.smaller(b.add(first, j.chunk), packs)) as pack:
-                self._write_pack(b.mul(pack, I64(e.count)), points, own_rows, values)
+            last = e.smaller(b.add(first, j.chunk), packs)
+            with e.repeat(first, last, BLOCK) as block:
+                end = e.smaller(b.add(block, I64(BLOCK)), last)
+                with e.repeat(block, end) as pack:
+                    self._find(b.mul(pack, I64(e.count)), b.sub(pack, block), points, values)
+                with e.repeat(block, end) as pack:
+                    self._write_pack(b.mul(pack, I64(e.count)), b.sub(pack, block), own_rows, values)
         b.ret_void()
 
-    def _write_pack(self, first: Value, points: Value, own_rows: Value, values: Value) -> None:
+    def _find(self, first: Value, index: Value, points: Value, values: Value) -> None:
+        """Locate a pack of points, and their data."""
         e, b, j = self.lanes, self.builder, self.job
-        left = b.sub(j.count, first)
-        within = e.first_lanes(left)
+        xy = self._points(e.advance(points, b.mul(first, I64(2)), e.number), b.sub(j.count, first))
+        places, cells = zip(*map(self._axis, xy, "xy"), strict=True)
+        at = self._located(places, list(map(self._first, cells, "xy")))
+        for n, own in enumerate(at.local):
+            e.store(own, self._kept(self.local, 2, index, n, e.number))
+        e.store(at.signs[1], self._kept(self.down, 1, index, 0, I32))
+        self.data.find(values, index, at.start, at.signs)
+        within = e.both(*map(self._within, cells, "xy"))
+        with b.if_then(b.not_(e.all(within)), likely=False):
+            start = self._located(places, list(map(self._folded, cells, "xy"))).start
+            self.data.copy(values, index, b.not_(within), [*start, *at.signs], self.variant.operation == "splat")
+        with b.if_then(b.icmp_signed("!=", j.asked, I64(0))):
+            self.data.ask(index)
+
+    def _kept(self, array: Value, packs: int, index: Value, number: int, kind: ir.Type) -> Value:
+        """Where pack `number` of so many is that are kept of a pack of points."""
+        b = self.builder
+        place = b.mul(b.add(b.mul(index, I64(packs)), I64(number)), I64(self.lanes.count))
+        return self.lanes.advance(array, place, kind)
+
+    def _write_pack(self, first: Value, index: Value, own_rows: Value, values: Value) -> None:
+        e, b, j = self.lanes, self.builder, self.job
+        within = e.first_lanes(b.sub(j.count, first))
         addresses = [e.advance(own_rows, b.add(b.mul(j.count, I64(n)), first), e.number) for n in range(len(self.rows))]
-        at = self._located(*self._points(e.advance(points, b.mul(first, I64(2)), e.number), left))
+        s, t = (e.load(self._kept(self.local, 2, index, n, e.number), e.number, e.count) for n in range(2))
+        down = e.load(self._kept(self.down, 1, index, 0, I32), I32, e.count)
         if self.variant.operation == "jet":
-            for row, address in zip(self._jet(at, values), addresses, strict=True):
+            for row, address in zip(self._jet(index, s, t, down), addresses, strict=True):
                 e.store_masked(row, address, within)
         else:
-            mask = e.both(within, at.known)
+            known = b.fcmp_ordered("ord", s, t)
+            s, t = (e.where(known, own, e.constant(0)) for own in (s, t))  # 0 · NaN is NaN
+            mask = e.both(within, known)
             cotangents = [e.load_masked(address, e.number, within) for address in addresses]
-            self._splat(at, values, [e.where(mask, own, e.constant(0)) for own in cotangents])
+            self._splat(index, s, t, down, [e.where(mask, own, e.constant(0)) for own in cotangents])
+            self.data.give(values, index)
 
     # --- where points are ---
 
@@ -142,86 +181,61 @@ class _Program:
         arithmetic = STORAGE[self.variant.arithmetic]
         return self.wide.convert(x, arithmetic), self.wide.convert(y, arithmetic)
 
-    def _located(self, x: Value, y: Value) -> _Located:
+    def _axis(self, x: Value, axis: str) -> tuple[Value, Value]:
+        """Where points are within their cells, in [0, 1], and which datum is the first of these, a double."""
+        w = self.wide
+        origin, step = (w.everywhere(getattr(self.job, f"{name}_{axis}")) for name in ("origin", "step"))
+        place = w.divide(w.subtract(x, origin), step)
+        cell = w.floor(place)
+        local = self.lanes.convert(w.subtract(place, cell), STORAGE["float64"])
+        return local, w.multiply(cell, w.constant(self.variant.pattern.steps))
+
+    def _within(self, first: Value, axis: str) -> Value:
+        """A mask: whether all data that a cell may need are in the grid; false for NaN."""
+        w, b, pattern = self.wide, self.builder, self.variant.pattern
+        size = w.everywhere(b.sitofp(getattr(self.job, f"size_{axis}"), DOUBLE))
+        after = w.add(first, w.constant(pattern.steps + pattern.reach))
+        return w.both(b.fcmp_ordered(">=", first, w.constant(pattern.reach)), b.fcmp_ordered("<", after, size))
+
+    def _first(self, first: Value, axis: str) -> Value:
+        """In 32 bits."""
+        w = self.wide
+        low, high = (w.everywhere(getattr(self.job, f"{name}_{axis}")) for name in ("low", "high"))
+        return w.to_integer(w.clamp(first, low, high))
+
+    def _folded(self, first: Value, axis: str) -> Value:
+        """As the tables have it, in 32 bits."""
+        w = self.wide
+        if self.variant.periodic:
+            low, high = (w.everywhere(getattr(self.job, f"{name}_{axis}")) for name in ("low", "high"))
+            first = w.subtract(first, w.multiply(w.floor(w.divide(first, high)), high))
+            first = w.where(w.less(first, low), w.add(first, high), first)
+            first = w.where(w.less(first, high), first, w.subtract(first, high))
+        return self._first(first, axis)
+
+    def _located(self, places: Sequence[Value], firsts: Sequence[Value]) -> _Located:
         e, b, m = self.lanes, self.builder, self.variant.pattern.steps
-        (s, column), (t, row) = (self._axis(value, axis) for value, axis in ((x, "x"), (y, "y")))
-        one, positive, negative = e.constant(1), e.integers_32(1), e.integers_32(-1)
+        (s, t), one, positive, negative = places, e.constant(1), e.integers_32(1), e.integers_32(-1)
         mirrored = self.variant.pattern.mirrored
         s = e.subtract(one, s) if mirrored else s
         up = b.fcmp_ordered("<=", e.add(s, t), one)
-        s, t = (e.where(up, own, e.subtract(one, own)) for own in (s, t))
+        local = [e.where(up, own, e.subtract(one, own)) for own in (s, t)]
         down = b.select(up, positive, negative)
         signs = [b.neg(down) if mirrored else down, down]
         start = [
             b.add(own, b.select(b.icmp_signed("<", sign, e.integers_32(0)), e.integers_32(m), e.integers_32(0)))
-            for own, sign in zip((column, row), signs, strict=True)
+            for own, sign in zip(firsts, signs, strict=True)
         ]
-        barycentric = [e.subtract(e.subtract(one, s), t), s, t]
-        known = b.fcmp_ordered("ord", s, t)
-        if self.variant.operation == "splat":  # 0 · NaN is NaN
-            barycentric = [e.where(known, own, e.constant(0)) for own in barycentric]
-        return _Located(barycentric, signs, start, known)
-
-    def _axis(self, x: Value, axis: str) -> tuple[Value, Value]:
-        """Where points are within their cells, in [0, 1], and the first datum of these, in 32 bits."""
-        w = self.wide
-        origin, step, low, high = (
-            w.everywhere(getattr(self.job, f"{name}_{axis}")) for name in ("origin", "step", "low", "high")
-        )
-        place = w.divide(w.subtract(x, origin), step)
-        cell = w.floor(place)
-        local = self.lanes.convert(w.subtract(place, cell), STORAGE["float64"])
-        first = w.multiply(cell, w.constant(self.variant.pattern.steps))
-        if self.variant.periodic:
-            first = w.subtract(first, w.multiply(w.floor(w.divide(first, high)), high))
-            first = w.where(w.less(first, low), w.add(first, high), first)
-            first = w.where(w.less(first, high), first, w.subtract(first, high))
-        return local, w.to_integer(w.clamp(first, low, high))
-
-    # --- what they read ---
-
-    def _places(self, at: _Located, axis: int) -> tuple[dict[int, list[Value]], dict[int, Value]]:
-        """For every step of an offset: where it is stored, for each lane, and whether that is within the data."""
-        e, b, j = self.lanes, self.builder, self.job
-        table, size = (j.column, j.size_x) if axis == 0 else (j.line, j.size_y)
-        found, inside = {}, {}
-        for step in sorted({offset[axis] for offset in self.variant.pattern.offsets}):
-            index = b.add(at.start[axis], b.mul(at.signs[axis], e.integers_32(step)))
-            lanes = [b.sext(b.extract_element(index, I32(lane)), I64) for lane in range(e.count)]
-            found[step] = [b.load(e.advance(table, own, I64), typ=I64) for own in lanes]
-            if self.variant.zeros:
-                most = e.everywhere(b.trunc(size, I32))
-                inside[step] = b.icmp_unsigned("<", index, most)
-        return found, inside
-
-    def _addresses(self, at: _Located, values: Value) -> list[tuple[list[Value], Value | None]]:
-        """For every datum its address, lane by lane, and a mask: whether it is one."""
-        (columns, in_columns), (lines, in_lines) = self._places(at, 0), self._places(at, 1)
-        found = []
-        for a, b in self.variant.pattern.offsets:
-            index = [self.builder.add(p, q) for p, q in zip(columns[a], lines[b], strict=True)]
-            mask = self.lanes.both(in_columns[a], in_lines[b]) if self.variant.zeros else None
-            found.append(([self.lanes.advance(values, own, self.storage.raw) for own in index], mask))
-        return found
-
-    def _read(self, addresses: Sequence[Value], mask: Value | None) -> Value:
-        e, b = self.lanes, self.builder
-        raw = ir.Constant(ir.VectorType(self.storage.raw, e.count), ir.Undefined)
-        for lane, address in enumerate(addresses):
-            one = b.load(address, typ=self.storage.raw, align=self.storage.bytes)
-            raw = b.insert_element(raw, one, I32(lane))
-        found = e.convert(raw, self.storage)
-        return found if mask is None else e.where(mask, found, e.constant(0))
+        return _Located(local, start, signs)
 
     # --- what they get and give ---
 
-    def _factors(self, at: _Located) -> list[Value]:
+    def _factors(self, down: Value) -> list[Value]:
         """By what derivatives along λ1 and λ2 are those along x and y, row by row."""
         e, w = self.lanes, self.wide
-        along = []
-        for sign, axis in zip(at.signs, "xy", strict=True):
-            per_step = w.divide(w.of_integer(sign), w.everywhere(getattr(self.job, f"step_{axis}")))
-            along.append(e.convert(per_step, STORAGE["float64"]))
+        signs = (self.builder.neg(down) if self.variant.pattern.mirrored else down), down
+        products = (w.multiply(w.of_integer(sign), own) for sign, own in zip(signs, self.per_step, strict=True))
+        along = [e.convert(own, STORAGE["float64"]) for own in products]
         return [self._power(along, i, j) for i, j in self.rows]
 
     def _power(self, along: Sequence[Value], i: int, j: int) -> Value:
@@ -230,22 +244,25 @@ class _Program:
             total = self.lanes.multiply(total, factor)
         return total
 
-    def _jet(self, at: _Located, values: Value) -> list[Value]:
+    def _barycentric(self, s: Value, t: Value) -> list[Value]:
         e = self.lanes
-        data = [self._read(addresses, mask) for addresses, mask in self._addresses(at, values)]
-        base = data[self.masks.first]
-        coefficients = self.masks.coefficients([e.subtract(datum, base) for datum in data])
-        found = self.masks.derivatives(coefficients, at.barycentric, self.variant.order)
-        value, *others = (e.multiply(own, factor) for own, factor in zip(found, self._factors(at), strict=True))
+        return [e.subtract(e.subtract(e.constant(1), s), t), s, t]
+
+    def _forward(self, down: Value) -> Value:
+        return self.builder.icmp_signed("<" if self.variant.pattern.mirrored else ">", down, self.lanes.integers_32(0))
+
+    def _jet(self, index: Value, s: Value, t: Value, down: Value) -> list[Value]:
+        e = self.lanes
+        forward = self._forward(down)
+        base = self.data.first(index, forward)
+        coefficients = self.masks.coefficients(e.subtract(datum, base) for datum in self.data.read(index, forward))
+        found = self.masks.derivatives(coefficients, self._barycentric(s, t), self.variant.order)
+        value, *others = (e.multiply(own, factor) for own, factor in zip(found, self._factors(down), strict=True))
         value = e.add(value, base)
         return [value, *(e.multiply_add(value, e.constant(0), own) for own in others)]  # in holes all are NaN
 
-    def _splat(self, at: _Located, values: Value, cotangents: Sequence[Value]) -> None:
-        e, b = self.lanes, self.builder
-        scaled = [e.multiply(own, factor) for own, factor in zip(cotangents, self._factors(at), strict=True)]
-        spread = self.masks.spread(scaled, at.barycentric, self.variant.order)
-        for own, (addresses, mask) in zip(spread, self._addresses(at, values), strict=True):
-            own = own if mask is None else e.where(mask, own, e.constant(0))
-            for lane, address in enumerate(addresses):
-                before = b.load(address, typ=e.number, align=self.storage.bytes)
-                b.store(b.fadd(before, b.extract_element(own, I32(lane))), address, align=self.storage.bytes)
+    def _splat(self, index: Value, s: Value, t: Value, down: Value, cotangents: Sequence[Value]) -> None:
+        e = self.lanes
+        scaled = [e.multiply(own, factor) for own, factor in zip(cotangents, self._factors(down), strict=True)]
+        spread = self.masks.spread(scaled, self._barycentric(s, t), self.variant.order)
+        self.data.add(index, self._forward(down), spread)

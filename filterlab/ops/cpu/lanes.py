@@ -435,8 +435,12 @@ class Lanes:
 
     def load_triples(self, address: Value) -> list[Value]:
         """x y z x y z … -> a pack of x, a pack of y, a pack of z."""
-        triples = self.load(address, self.number, 3 * self.count)
-        return [self.shuffle(triples, triples, range(axis, 3 * self.count, 3)) for axis in range(3)]
+        return self.load_tuples(address, 3)
+
+    def load_tuples(self, address: Value, axes: int) -> list[Value]:
+        """Of points of so many axes a pack of every coordinate."""
+        every = self.load(address, self.number, axes * self.count)
+        return [self.shuffle(every, every, range(axis, axes * self.count, axes)) for axis in range(axes)]
 
     def store_triples(self, packs: list[Value], address: Value) -> None:
         """The inverse of `load_triples`."""
@@ -473,6 +477,10 @@ class Lanes:
         if pack is not None:
             self.builder.store(pack, place)
         return Kept(self.builder, place, kind.element)
+
+    def ask(self, address: Value) -> None:
+        """Have the line of memory at an address brought near, if there is one: nothing waits for it, nothing fails."""
+        self._intrinsic("llvm.prefetch.p0", ir.VoidType(), [address, I32(0), I32(3), I32(1)])
 
     def copy(self, target: Value, source: Value, size: Value) -> None:
         """`size` bytes."""

@@ -25,12 +25,15 @@ Memory: copies of the points and rows of `POINTS_AT_ONCE` points, 4 bytes more f
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from filterlab.ops.cpu import compiler, threads
+from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.cpu.sorting import AXES, SortingJob, SortingVariant
 
 POINTS_AT_ONCE = 1 << 22  # points that are sorted together, for which copies of points and rows are held
@@ -39,43 +42,68 @@ _MOST_BRICKS = 1 << 16
 _LOOKED_AT = 2048
 
 
-def scattered(points: Tensor) -> bool:
-    """Whether most points lie more than a brick from the one before: looked at in a few places."""
+def scattered(points: Tensor, edge: Tensor | float = _EDGE) -> bool:
+    """Whether most points (N, M, axes) lie more than a brick from the one before: looked at in a few places."""
     count = points.shape[1]
     at = torch.linspace(0, count - 2, min(_LOOKED_AT, count - 1), dtype=torch.float64).long()
-    steps = (points[:, at + 1] - points[:, at]).abs().amax(-1)
-    return bool((steps > _EDGE).double().mean() > 0.5)
+    far = ((points[:, at + 1] - points[:, at]).abs() > edge).any(-1)
+    return bool(far.double().mean() > 0.5)
+
+
+@dataclass(frozen=True)
+class Bricks:
+    """What points are sorted by, along x, y and, of a volume, z.
+
+    Attributes:
+        start: where the first brick begins.
+        edge: how long one is; negative where they go the other way.
+        count: how many there are.
+    """
+
+    start: tuple[float, ...]
+    edge: tuple[float, ...]
+    count: tuple[int, ...]
+
+    @classmethod
+    def of(cls, sizes: Sequence[int], start: Sequence[float], step: Sequence[float], edge: int = _EDGE) -> Bricks:
+        """Of so many coefficients, `edge` of them in a brick along every axis, more where there were too many bricks.
+
+        Args:
+            sizes: of the coefficients along every axis.
+            start: coordinates of the first coefficient.
+            step: from one to the next.
+        """
+        while math.prod(-(-n // edge) for n in sizes) > _MOST_BRICKS:
+            edge *= 2
+        return cls(tuple(start), tuple(edge * s for s in step), tuple(-(-n // edge) for n in sizes))
 
 
 class Sorted:
     """Some points sorted by bricks.
 
     Args:
-        points: (M, 3), contiguous, in coordinates of the coefficients, M at least the lanes of a pack.
-        shape: (D, H, W) of the coefficients.
-        start: the coordinate of coefficient 0.
+        points: (M, axes), contiguous, M at least the lanes of a pack.
+        bricks: in the coordinates of the points; what is beyond belongs to the nearest one.
         lanes: P.
 
     Attributes:
-        points: (M, 3), sorted; the order within a brick is that of the points.
+        points: (M, axes), sorted; the order within a brick is that of the points.
     """
 
-    def __init__(self, points: Tensor, shape: tuple[int, int, int], start: int, lanes: int) -> None:
+    def __init__(self, points: Tensor, bricks: Bricks, lanes: int) -> None:
         self.arithmetic, self.lanes = str(points.dtype).removeprefix("torch."), lanes
-        self.count = points.shape[0]
+        self.count, self.axes = points.shape
         assert self.count >= lanes, f"{self.count} points are fewer than a pack of {lanes}"
-        edge = _EDGE
-        while math.prod(-(-n // edge) for n in shape) > _MOST_BRICKS:
-            edge *= 2
-        bricks = [-(-n // edge) for n in shape[::-1]]
-        self._begin = np.zeros(math.prod(bricks), np.int32)
+        self._begin = np.zeros(math.prod(bricks.count), np.int32)
         self._rank = np.empty(self.count, np.int32)
-        moved = np.empty((self.count, 3), self.arithmetic)
-        job = self._job(start=start, per_edge=1 / edge)
+        moved = np.empty((self.count, self.axes), self.arithmetic)
+        job, step = self._job(), 1
         job.point(points=points, sorted=moved)
-        for axis, number, step in zip(AXES, bricks, (1, bricks[0], bricks[0] * bricks[1]), strict=True):
-            setattr(job, f"last_{axis}", number - 1)
-            setattr(job, f"step_{axis}", step)
+        for axis, start, edge, number in zip(AXES, bricks.start, bricks.edge, bricks.count, strict=False):
+            told = {"start": start, "per_edge": 1 / edge, "last": number - 1, "step": step}
+            for name, value in told.items():
+                setattr(job, f"{name}_{axis}", value)
+            step *= number
         self._run("count", job)
         self._begin[:] = np.cumsum(self._begin) - self._begin
         self._run("move", job)
@@ -101,4 +129,14 @@ class Sorted:
 
     def _run(self, step: str, job: SortingJob) -> None:
         job.next = 0
-        threads.run(compiler.compiled(SortingVariant(step, self.arithmetic, self.lanes)), [job])
+        threads.run(compiler.compiled(SortingVariant(step, self.arithmetic, self.lanes, self.axes)), [job])
+
+
+def in_order(points: Tensor, bricks: Bricks) -> Iterator[tuple[int, slice, Sorted]]:
+    """(batch entry, which of its points, those points sorted), of (N, M, axes), in parts, so that copies stay small."""
+    count = points.shape[1]
+    parts = -(-count // POINTS_AT_ONCE)
+    for entry, own in enumerate(points):
+        for i in range(parts):
+            part = slice(count * i // parts, count * (i + 1) // parts)
+            yield entry, part, Sorted(own[part], bricks, lanes_of(points.dtype))

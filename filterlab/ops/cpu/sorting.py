@@ -1,4 +1,4 @@
-"""Points sorted by bricks of the volume, and rows put back in the order of the points: a counting sort.
+"""Points sorted by bricks of a volume or tiles of a plane, and rows put back in their order: a counting sort.
 
     count    brick b of every point; total[b] += 1
     (the caller turns totals into the place where each brick's points begin)
@@ -25,8 +25,8 @@ from filterlab.ops.cpu.lanes import I32, I64, Lanes, Value
 FIELDS: dict[str, type] = {
     "next": ctypes.c_int64,
     "chunks": ctypes.c_int64,
-    "points": ctypes.c_void_p,  # (M, 3)
-    "sorted": ctypes.c_void_p,  # (M, 3)
+    "points": ctypes.c_void_p,  # (M, axes)
+    "sorted": ctypes.c_void_p,  # (M, axes)
     "brick": ctypes.c_void_p,  # (M) int32; afterwards the rank
     "begin": ctypes.c_void_p,  # (bricks) int32
     "rows": ctypes.c_void_p,  # (J, `stride`)
@@ -34,8 +34,8 @@ FIELDS: dict[str, type] = {
     "stride": ctypes.c_int64,  # from one row to the next
     "row_count": ctypes.c_int64,  # J
     "count": ctypes.c_int64,  # M
-    "start": ctypes.c_double,  # coordinate of coefficient 0
-    "per_edge": ctypes.c_double,  # 1 / edge of a brick
+    **{f"start_{a}": ctypes.c_double for a in AXES},  # where the first brick begins
+    **{f"per_edge_{a}": ctypes.c_double for a in AXES},  # 1 / edge of a brick
     **{f"last_{a}": ctypes.c_double for a in AXES},  # number of the last brick
     **{f"step_{a}": ctypes.c_int64 for a in AXES},  # from one brick to the next
 }
@@ -53,11 +53,13 @@ class SortingVariant:
         step: "count", "move", "restore" or "arrange".
         arithmetic: "float32" or "float64".
         lanes: P.
+        axes: that points have, 2 or 3.
     """
 
     step: str
     arithmetic: str
     lanes: int
+    axes: int
 
     def generate(self) -> str:
         """The program as LLVM IR text."""
@@ -66,25 +68,35 @@ class SortingVariant:
         e = Lanes(builder, self.arithmetic, self.lanes)
         told = frame.load_job(e, function.args[0], FIELDS)
         with frame.every_chunk(e, told):
-            {"count": _count, "move": _move, "restore": _restore, "arrange": _arrange}[self.step](e, told)
+            match self.step:
+                case "count":
+                    _count(e, told, self.axes)
+                case "move":
+                    _move(e, told, self.axes)
+                case "restore":
+                    _restore(e, told)
+                case "arrange":
+                    _arrange(e, told)
         builder.ret_void()
         return str(module)
 
 
-def _count(e: Lanes, job: SimpleNamespace) -> None:
+def _count(e: Lanes, job: SimpleNamespace, axes: int) -> None:
     """The last pack begins early enough to be whole; what it has in common with the one before counts once."""
     b = e.builder
-    low, per_edge = e.everywhere(e.scalar(job.start)), e.everywhere(e.scalar(job.per_edge))
-    last = [e.everywhere(e.scalar(getattr(job, f"last_{a}"))) for a in AXES]
-    step = [e.everywhere(b.trunc(getattr(job, f"step_{a}"), I32)) for a in AXES]
+    start, per_edge, last = (
+        [e.everywhere(e.scalar(getattr(job, f"{name}_{a}"))) for a in AXES[:axes]]
+        for name in ("start", "per_edge", "last")
+    )
+    step = [e.everywhere(b.trunc(getattr(job, f"step_{a}"), I32)) for a in AXES[:axes]]
     with e.repeat(I64(0), job.count, e.count) as first:
         left = b.sub(job.count, first)
         whole = b.icmp_signed(">=", left, I64(e.count))
         at = b.select(whole, first, b.sub(job.count, I64(e.count)))
-        points = e.load_triples(e.advance(job.points, b.mul(at, I64(3)), e.number))
+        points = e.load_tuples(e.advance(job.points, b.mul(at, I64(axes)), e.number), axes)
         brick = None
-        for x, most, stride in zip(points, last, step, strict=True):
-            number = e.floor(e.multiply(e.subtract(x, low), per_edge))
+        for x, low, scale, most, stride in zip(points, start, per_edge, last, step, strict=True):
+            number = e.floor(e.multiply(e.subtract(x, low), scale))
             part = b.mul(e.to_integer(e.clamp(number, e.constant(0), most)), stride)
             brick = part if brick is None else b.add(brick, part)
         e.store(brick, e.advance(job.brick, at, I32))
@@ -95,7 +107,7 @@ def _count(e: Lanes, job: SimpleNamespace) -> None:
             b.store(b.add(b.load(total, typ=I32), one), total)
 
 
-def _move(e: Lanes, job: SimpleNamespace) -> None:
+def _move(e: Lanes, job: SimpleNamespace, axes: int) -> None:
     b = e.builder
     with e.repeat(I64(0), job.count) as i:
         place = e.advance(job.brick, i, I32)
@@ -103,9 +115,9 @@ def _move(e: Lanes, job: SimpleNamespace) -> None:
         rank = b.load(begin, typ=I32)
         b.store(b.add(rank, I32(1)), begin)
         b.store(rank, place)
-        source = e.advance(job.points, b.mul(i, I64(3)), e.number)
-        target = e.advance(job.sorted, b.mul(b.zext(rank, I64), I64(3)), e.number)
-        e.store(e.load(source, e.number, 3), target)
+        source = e.advance(job.points, b.mul(i, I64(axes)), e.number)
+        target = e.advance(job.sorted, b.mul(b.zext(rank, I64), I64(axes)), e.number)
+        e.store(e.load(source, e.number, axes), target)
 
 
 def _restore(e: Lanes, job: SimpleNamespace) -> None:
