@@ -9,15 +9,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
 
+from filterlab.fields.base import Field
 from filterlab.fields.grid import GridField
 from filterlab.fields.tensor_product import Direct
 from filterlab.fields.tetrahedral import OnTetrahedra
-from filterlab.ops.differentiable import march
+from filterlab.ops.differentiable import march, projection
 from filterlab.ops.march import Bricks, Chords, Lighting, March, Transfer
+from filterlab.ops.projection import Projection
 from filterlab.ops.reference.optics import safe_normalize
 from filterlab.ops.tetrahedra import AnyStencil
 from filterlab.render.bricks import bricks_of
@@ -40,7 +43,7 @@ def why_not_fused(medium: Medium) -> str | None:
     are the plain marcher's.
     """
     field = medium.field
-    if not isinstance(field, GridField) or not isinstance(field.scheme, _SUMS) or field.scheme.name != "fused":
+    if not _is_sum(field):
         scheme = f"scheme {field.scheme.name!r}" if isinstance(field, GridField) else f"a {type(field).__name__}"
         return f"it marches fields of scheme 'fused'; this is {scheme}"
     values, start = field.coefficients.values, field.coefficients.start
@@ -53,6 +56,25 @@ def why_not_fused(medium: Medium) -> str | None:
         return "control points fall together when they are rounded to how coefficients are stored"
     lights = len(medium.shading.lights) if medium.shading else 0
     return march.missing(values[(0,) * (values.ndim - 3)], _stencil(medium), start, medium.dtype, lights)
+
+
+def _is_sum(field: Field) -> TypeGuard[GridField]:
+    """Whether a field is one whose taps programs sum along rays."""
+    return isinstance(field, GridField) and isinstance(field.scheme, _SUMS) and field.scheme.name == "fused"
+
+
+def projection_of(field: Field, chords: Chords, step: float, dtype: torch.dtype) -> Projection | None:
+    """A maximum intensity projection that a program makes; None where none can.
+
+    Of stored integers the largest is what stands for the largest coefficient sum.
+    """
+    if not _is_sum(field) or chords.length.device != field.coefficients.values.device:
+        return None
+    assert isinstance(field.scheme, _SUMS)
+    values, start, stencil = field.coefficients.values, field.coefficients.start, field.scheme.stencils[0]
+    if projection.missing(values, stencil, start, dtype) is not None:
+        return None
+    return Projection(values, start, stencil, _in_the_grid(field, chords), step, dtype)
 
 
 def _stencil(medium: Medium) -> AnyStencil:

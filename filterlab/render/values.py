@@ -2,8 +2,8 @@
 
     rays ─▶ samples, or where they meet the plane ─▶ one value a pixel, NaN where there is none ─▶ `colored`
 
-Values are the field's own, of any method, fused where its scheme is; a band of pixels is in work at a time. A NaN of
-the field is a voxel without a value: it is passed over.
+Values are the field's own, of any method; which sample is the largest is found by a program where the field's scheme is
+fused. A band of pixels is in work at a time. A NaN of the field is a voxel without a value: it is passed over.
 """
 
 from __future__ import annotations
@@ -17,10 +17,20 @@ import torch
 from torch import Tensor
 
 from filterlab.fields.base import Domain, Field
+from filterlab.ops.differentiable import projection
 from filterlab.ops.march import Chords
 from filterlab.ops.reference.optics import dot, safe_normalize
+from filterlab.ops.reference.projection import (
+    BLOCK,
+    BYTES_PER_SAMPLE,
+    OnChords,
+    middles,
+    number_of_largest,
+    rays_at_once,
+)
 from filterlab.render.camera import WHOLE, Camera, OrthographicCamera, Vector, Window
 from filterlab.render.dvr import Cut
+from filterlab.render.fused import projection_of
 from filterlab.render.image import (
     CENTER,
     Canvas,
@@ -37,10 +47,6 @@ from filterlab.render.image import (
 from filterlab.render.rays import Region, check_region
 from filterlab.render.sampling import Sampling
 
-_BLOCK = 64  # samples of a ray that are evaluated together
-_BYTES_PER_SAMPLE = 160
-"""Of points in float64 and in the field's type, lengths, values and their comparison, roughly."""
-_SAMPLES = 1 << 16  # that are evaluated together; more would only leave the caches
 _PART = 1 << 15  # pixels at a time
 _BYTES_PER_RAY = 256  # of a part: origins, directions, chords or points, values
 _EDGE = 1e-9  # of the box, by which a plane on one of its faces may be beside it
@@ -117,26 +123,19 @@ def _count(cut: Cut, seen: PixelRays) -> float:
 
 def _largest(field: Field, chords: Chords, step: float, sampling: Sampling) -> Tensor:
     """The largest value on every chord `(R,)`."""
-    number = _number_of_largest(_along(field.detached(), sampling.dtype), chords, step, sampling)
+    number = _number_of_largest(field.detached(), chords, step, sampling)
     some = (number >= 0).nonzero()[:, 0]
     found = torch.full_like(chords.length, math.nan, dtype=sampling.dtype)
     there = chords.at(some)
-    values = _along(field, sampling.dtype)(there, _middles(there, step, number[some, None]))
+    values = _along(field, sampling.dtype)(there, middles(there, step, number[some, None]))
     return found.index_put((some,), values[:, 0])
 
 
-def _middles(chords: Chords, step: float, number: Tensor) -> Tensor:
-    """How far along chords the middles of the segments of those numbers lie, `(R, K)`; `ops.reference.march.segments`.
-
-    Differentiable in the lengths, of which the last segment is what is left.
-    """
-    end = (number + chords.offset[:, None]) * step
-    length = chords.length[:, None]
-    return (torch.minimum((end - step).clamp_min(0), length) + torch.minimum(end, length)) / 2
-
-
-OnChords = Callable[[Chords, Tensor], Tensor]
-"""Values (R, K) at distances (R, K) along chords."""
+def _number_of_largest(field: Field, chords: Chords, step: float, sampling: Sampling) -> Tensor:
+    """The number of the first of the largest samples of every chord `(R,)`; −1 where none has a value."""
+    if (given := projection_of(field, chords, step, sampling.dtype)) is not None:
+        return projection.largest(given)
+    return number_of_largest(_along(field, sampling.dtype), chords, step, sampling.dtype, sampling.memory)
 
 
 def _along(field: Field, dtype: torch.dtype) -> OnChords:
@@ -151,40 +150,10 @@ def _along(field: Field, dtype: torch.dtype) -> OnChords:
     return values
 
 
-def _number_of_largest(values: OnChords, chords: Chords, step: float, sampling: Sampling) -> Tensor:
-    """The number of the first of the largest samples of every chord `(R,)`; −1 where none has a value."""
-    chords = Chords(*(x.detach() for x in vars(chords).values()))
-    best = torch.full_like(chords.length, -math.inf, dtype=sampling.dtype)
-    number = torch.full_like(chords.count, -1)
-    alive, first = (chords.count > 0).nonzero()[:, 0], 0
-    while len(alive):
-        for rays in alive.split(_rays_at_once(sampling.memory)):
-            value, index = _block(values, chords.at(rays), step, first)
-            better = value > best[rays]
-            best[rays] = torch.where(better, value, best[rays])
-            number[rays] = torch.where(better, index, number[rays])
-        first += _BLOCK
-        alive = alive[chords.count[alive] > first]
-    return number
-
-
-def _block(values: OnChords, chords: Chords, step: float, first: int) -> tuple[Tensor, Tensor]:
-    """(largest value, its number) `(R,)` among K samples of every chord; −∞ where none has a value."""
-    number = torch.arange(first, first + _BLOCK, device=chords.count.device)
-    value = values(chords, _middles(chords, step, number)).detach()
-    real = number < chords.count[:, None]
-    largest, index = torch.where(real & ~value.isnan(), value, -math.inf).max(-1)
-    return largest, first + index
-
-
-def _rays_at_once(memory: int) -> int:
-    return max(min(memory // _BYTES_PER_SAMPLE, _SAMPLES) // _BLOCK, 1)
-
-
 def work_of_projection(rays: int, memory: int) -> int:
     """Bytes that samples and rays in work take at most, roughly."""
     part = min(rays, _PART)
-    return min(part, _rays_at_once(memory)) * _BLOCK * _BYTES_PER_SAMPLE + part * _BYTES_PER_RAY
+    return min(part, rays_at_once(memory)) * BLOCK * BYTES_PER_SAMPLE + part * _BYTES_PER_RAY
 
 
 def work_of_plane(rays: int) -> int:

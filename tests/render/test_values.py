@@ -63,6 +63,20 @@ def test_the_largest_of_the_samples_of_every_method(method: str) -> None:
     torch.testing.assert_close(image, expected, rtol=0, atol=0 if method == "nearest" else 1e-12, equal_nan=True)
 
 
+@pytest.mark.parametrize("storage", [None, "float16", "uint8"])
+def test_programs_and_plain_torch_make_the_same_projection(
+    storage: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field = reconstruct(volume(affine=AFFINE), "tricubic", storage=storage, scheme="fused")
+    seen = {"camera": camera_of(field), "size": (19, 18), "step": 0.3, "jitter_seed": 3, "dtype": torch.float64}
+    region = tuple((field.domain.corners()[0] * a + field.domain.corners()[-1] * (1 - a)).tolist() for a in (0.8, 0.2))
+    seen["region"] = tuple(zip(*(sorted(pair) for pair in zip(*region, strict=True)), strict=True))
+    image = project(field, **seen)
+    assert 50 < int(image.isnan().sum()) < 300
+    monkeypatch.setattr("filterlab.render.values.projection_of", lambda *given: None)
+    torch.testing.assert_close(image, project(field, **seen), rtol=0, atol=1e-14, equal_nan=True)
+
+
 def test_jitter_moves_the_samples() -> None:
     field = reconstruct(volume(), "triquadratic")
     camera = camera_of(field)

@@ -89,7 +89,7 @@ FIELDS: dict[str, type] = {
 }
 
 
-_WRITTEN_OUT = 12  # rows times planes, see `Taps`
+WRITTEN_OUT = 12  # rows times planes, see `Taps`
 
 
 class MarchJob(job.Job):
@@ -133,7 +133,7 @@ class MarchVariant:
         return str(module)
 
 
-class _Parts:
+class Parts:
     """The sums over taps of a pack, part by part.
 
     The sums need most registers, so that a part of them fills one register with every number. All else is chains of
@@ -198,7 +198,7 @@ class _Program:
         self.job = j = frame.load_job(e, self.function.args[0], FIELDS)
         self.grid = Grid.of(j)
         taps = self.of_coefficients(self.variant.stencil)
-        self.taps = _Parts(e, taps)
+        self.taps = Parts(e, taps)
         steps = Steps(j.steps_low, j.steps_scale, j.steps_last)
         tables = j.opacities, j.colors, j.intervals, j.buckets
         self.table, self.table_of_run = (
@@ -211,7 +211,7 @@ class _Program:
         b.ret_void()
 
     def of_coefficients(self, stencil: LoweredStencil) -> Sums:
-        return sums_of(self.part, stencil, self.storage, self.grid, self.variant.room, _WRITTEN_OUT)
+        return sums_of(self.part, stencil, self.storage, self.grid, self.variant.room, WRITTEN_OUT)
 
     def _march_block(self) -> None:
         with self.traversal.every_ray() as (number, state):
@@ -429,10 +429,10 @@ class _Adjoint(_Program):
         number = STORAGE[variant.arithmetic]
         self.spreading = self.taps
         if number != self.storage:  # derivatives by the coefficients are kept in the arithmetic's type
-            self.spreading = _Parts(e, sums_of(self.part, variant.stencil, number, self.grid))
+            self.spreading = Parts(e, sums_of(self.part, variant.stencil, number, self.grid))
         if variant.derivatives is not None:
             self.raised = variant.derivatives[1]
-            self.differentiating = _Parts(e, self.of_coefficients(variant.derivatives[0]))
+            self.differentiating = Parts(e, self.of_coefficients(variant.derivatives[0]))
         self.columns = gradient_columns(variant.lights if variant.lit else None)
 
     def wants(self, name: str) -> bool:

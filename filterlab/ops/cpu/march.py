@@ -8,6 +8,7 @@ thread (within `SPLAT_MEMORY`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,13 +17,14 @@ from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.compositing import TABLES, MarchJob, MarchVariant
 from filterlab.ops.cpu.gather import SPLAT_MEMORY
-from filterlab.ops.cpu.job import AXES
+from filterlab.ops.cpu.job import AXES, Function
 from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.cpu.memory import ARITHMETIC, has_room, zeros
 from filterlab.ops.cpu.traversal import RAYS_OF_A_BLOCK
 from filterlab.ops.gather import STORAGE
 from filterlab.ops.march import March, Steps
 from filterlab.ops.march_derivatives import TABLE_ROW, by_name, columns_of_rays
+from filterlab.ops.tetrahedra import AnyStencil
 
 RAYS_AT_ONCE = 1 << 13  # then progress is reported, and Ctrl-C heard
 
@@ -34,7 +36,8 @@ def march(given: March, report: Report = lambda rays: None) -> tuple[Tensor, Ten
     rays = len(given.chords.count)
     light, depth = torch.zeros(rays, 3, dtype=torch.float64), torch.zeros(rays, dtype=torch.float64)
     if rays:
-        _Run(given, (), {"light": light, "depth": depth}).all_rays(report)
+        run = _Run(given, (), {"light": light, "depth": depth})
+        in_blocks(run.function, run.job, rays, report)
     return light, depth
 
 
@@ -73,6 +76,25 @@ def _threads_of_adjoint(given: March, with_volumes: bool) -> int:
     return threads
 
 
+def in_blocks(function: Function, job: Any, rays: int, report: Report) -> None:
+    """Let the threads loose on one portion of the rays after the other."""
+    for first in range(0, rays, RAYS_AT_ONCE):
+        job.first, job.last = first, min(first + RAYS_AT_ONCE, rays)
+        job.stride = job.chunks = -(-(job.last - first) // RAYS_OF_A_BLOCK)
+        job.next = 0
+        pool.run(function, [job] * max(1, min(torch.get_num_threads(), job.chunks)))
+        report(job.last)
+
+
+def lie(job: Any, coefficients: Tensor, start: int, stencil: AnyStencil) -> None:
+    """Writes how coefficients lie in memory and in space into the fields of `ops.cpu.taps.Grid`."""
+    d, h, w = coefficients.shape
+    job.width, job.height, job.start = w, h, start
+    for axis, size, support in zip(AXES, (w, h, d), stencil.supports, strict=True):
+        setattr(job, f"low_{axis}", start)
+        setattr(job, f"high_{axis}", start + size - support)
+
+
 class _Run:
     """A march and the arrays that it reads and writes, as a job."""
 
@@ -85,16 +107,6 @@ class _Run:
         if (steps := given.transfer.steps) is not None and steps.buckets is not None:
             inputs["buckets"] = steps.buckets
         self.job.point(**{name: tensor.detach().resolve_neg().contiguous() for name, tensor in inputs.items()})
-
-    def all_rays(self, report: Report) -> None:
-        """Let the threads loose on one portion of the rays after the other."""
-        job = self.job
-        for first in range(0, self.rays, RAYS_AT_ONCE):
-            job.first, job.last = first, min(first + RAYS_AT_ONCE, self.rays)
-            job.stride = job.chunks = -(-(job.last - first) // RAYS_OF_A_BLOCK)
-            job.next = 0
-            pool.run(self.function, [job] * max(1, min(torch.get_num_threads(), job.chunks)))
-            report(job.last)
 
     def own_rays(self, tables: Tensor, volumes: list[Tensor], report: Report) -> None:
         """The same with a job for each of `tables`: thread i takes blocks i, i + threads, … of the rays."""
@@ -113,20 +125,14 @@ class _Run:
 
 def _job(given: March) -> MarchJob:
     """With every number, and no address."""
-    d, h, w = given.coefficients.shape
     job = MarchJob(
-        width=w,
-        height=h,
-        start=given.start,
         step=given.step,
         per_unit=1 / given.transfer.unit,
         faint=given.faint,
         opaque=given.opaque,
         intervals=max(len(given.transfer.positions) - 1, 1),
     )
-    for axis, size, support in zip(AXES, (w, h, d), given.stencil.supports, strict=True):
-        setattr(job, f"low_{axis}", given.start)
-        setattr(job, f"high_{axis}", given.start + size - support)
+    lie(job, given.coefficients, given.start, given.stencil)
     if (steps := given.transfer.steps) is not None:
         job.steps_low, job.steps_scale, job.steps_last = steps.low, steps.scale, steps.count - 1
     if given.bricks is not None:
