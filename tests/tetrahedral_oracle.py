@@ -207,8 +207,9 @@ def _orbit(canonical: Sequence[Tetrahedron]) -> tuple[Tetrahedron, ...]:
     found: dict[frozenset[Vector], Tetrahedron] = {}
     for one in canonical:
         for matrix in signed_permutations():
-            image = one.image(matrix)
-            found.setdefault(frozenset(image.vertices), image)
+            vertices = frozenset(_turned(matrix, v) for v in one.vertices)
+            if vertices not in found:
+                found[vertices] = one.image(matrix)
     return tuple(found.values())
 
 

@@ -45,6 +45,9 @@ from filterlab.surfaces.base import Hits, Surface
 COUNTED = 64
 """Hits of a ray that are told apart: edges behind the last are not seen."""
 
+_FINER = (
+    8  # times as many parts of lines where but one hit of a ray is looked at, which is found sooner, and tells less
+)
 _CUT, _ROUNDS = 8, 10  # parts that what an edge lies in is cut into, and how often: L is that of 8⁻¹⁰ of it away
 _APART, _STEEP = 0.125, 1  # voxels, and times how far rays are apart, by which hits differ if there is an edge between
 _AT_FACE = 1e-4  # of the domain's diagonal: a hit that vanishes farther from a face is none that left through it
@@ -59,7 +62,8 @@ class Silhouettes:
     Attributes:
         lines: through every pixel, each across or down at a place that is drawn; more of them make derivatives less
             noisy, and change nothing of what is expected.
-        parts: of each line, at whose ends hits are compared: what comes and goes again within one is not seen.
+        parts: of each line, at whose ends hits are compared: what comes and goes again within one is not seen. Those of
+            opaque surfaces are cut into eight.
 
     Raises:
         ValueError: not two integers from 1 to 64.
@@ -207,7 +211,8 @@ def swept(how: Silhouettes, eye: Eye, pixels: Tensor, seed: int) -> Tensor:
 def _found(eye: Eye, lines: _Lines, parts: int) -> _Edges:
     """In parts of lines, those are cut on at whose ends hits are others, until but edges are left."""
     ends = [torch.full_like(lines.beside, x) for x in (0.0, 1.0)]
-    stretches = _cut(eye, _Stretches(lines, *ends, *(eye.shown(lines, x) for x in ends)), parts)
+    whole = _Stretches(lines, *ends, *(eye.shown(lines, x) for x in ends))
+    stretches = _cut(eye, whole, parts if whole.before.shape[1] > 1 else _FINER * parts)
     for _ in range(_ROUNDS):
         stretches = _cut(eye, stretches, _CUT)
     twice = _Lines(*(torch.cat((field, field)) for field in stretches.lines))
@@ -226,7 +231,8 @@ def _cut(eye: Eye, stretches: _Stretches, parts: int) -> _Stretches:
     x, hits = (
         torch.cat(row, 1) for row in ((low[:, None], between, high[:, None]), (before[:, None], hits, behind[:, None]))
     )
-    slack = torch.clamp(_STEEP * eye.apart(stretches) / parts, min=_APART * eye.surface.domain.voxel_size)
+    least = _APART / (_FINER if before.shape[1] == 1 else 1) * eye.surface.domain.voxel_size
+    slack = torch.clamp(_STEEP * eye.apart(stretches) / parts, min=least)
     row, part = _differ(hits[:, :-1], hits[:, 1:], slack[:, None]).nonzero().unbind(-1)
     return _Stretches(lines.some(row), x[row, part], x[row, part + 1], hits[row, part], hits[row, part + 1])
 

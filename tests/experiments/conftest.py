@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,3 +46,9 @@ def command():
         )
 
     return start
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Figures of reports stay empty: it takes half a second to write one, and there are tests of what is said alone."""
+    monkeypatch.setattr(Figure, "savefig", lambda _, file, **__: file.write("<svg></svg>"))

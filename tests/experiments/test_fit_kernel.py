@@ -377,7 +377,7 @@ def test_verdicts_follow_from_the_records(ran):
     assert own["value"]["ratio"] == pytest.approx(against["value"]["ratio"])
 
 
-def test_the_report_says_what_the_records_say(ran):
+def test_the_report_says_what_the_records_say(ran, undrawn):
     """Records with another outcome give another sentence: nothing is written beforehand."""
     folder, records = ran
     config = Config(**TINY)
@@ -400,7 +400,7 @@ def test_an_unfinished_run_is_drawn_as_far_as_it_is(ran):
         draw(config, dict(list(records.items())[:count]), folder)
 
 
-def test_a_scan_from_a_file_is_a_class_too(tmp_path):
+def test_a_scan_from_a_file_is_a_class_too(undrawn, tmp_path):
     path = tmp_path / "scan.npy"
     generator = torch.Generator().manual_seed(4)
     fl.io.save_volume(fl.Volume(torch.randint(0, 255, (9, 12, 41), dtype=torch.uint8, generator=generator)), path)

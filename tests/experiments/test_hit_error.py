@@ -132,7 +132,7 @@ def test_hits_have_the_order_of_the_method(name, distance, normal):
     assert rms_error.slope([24, 48], [r["normal_rms"] for r in found]) == pytest.approx(normal, abs=0.3)
 
 
-def test_records_are_those_of_the_definition(tmp_path):
+def test_records_are_those_of_the_definition(undrawn, tmp_path):
     path = tmp_path / "hits.yaml"
     studies = [{**SPHERE, "resolutions": [8, 16], "fit_from": 8}]
     path.write_text(yaml.safe_dump(config(methods=["notch"], studies=studies).model_dump(mode="json")))

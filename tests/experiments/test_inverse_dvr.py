@@ -248,7 +248,7 @@ def test_an_interrupted_recovery_goes_on_with_the_same_bits(uninterrupted, tmp_p
     assert not list(tmp_path.rglob(".tmp*"))
 
 
-def test_the_command_goes_on_where_it_stopped(uninterrupted, tmp_path, monkeypatch, capsys):
+def test_the_command_goes_on_where_it_stopped(undrawn, uninterrupted, tmp_path, monkeypatch, capsys):
     made = interrupt(monkeypatch, 9)
     run(tmp_path, short(), code=130)
     assert "0 of 1 are done and kept" in capsys.readouterr().err

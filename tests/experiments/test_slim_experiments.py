@@ -56,7 +56,7 @@ def test_four_times_as_many_triangles_are_four_times_as_near():
     assert slim_error._off(shape, *slim_error.as_near(shape, few)) == pytest.approx(few, rel=0.1)
 
 
-def test_covers_are_told_of_beside_triangles(ran):
+def test_covers_are_told_of_beside_triangles(undrawn, ran):
     study = {"shape": "torus", "points": 2500, "tolerances": [3e-3, 5e-4]}
     records, folder = ran({"experiment": "slim_error", "studies": [study], "rays": 200, "orders": [2]})
     few, many = records["0/2/0"], records["0/2/1"]

@@ -263,7 +263,7 @@ def test_a_scan_is_known_where_every_second_voxel_was_left_out(scan):
     torch.testing.assert_close(known.span * gradient, expected, rtol=0, atol=0.01)
 
 
-def test_a_scan_in_place_of_signals(scan, tmp_path):
+def test_a_scan_in_place_of_signals(undrawn, scan, tmp_path):
     c = config(volume={"file": str(scan)}, points=400)
     speed_accuracy.check(c)
     run = Run(tmp_path, {})

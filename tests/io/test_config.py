@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field, ValidationInfo, field_validator
 
@@ -299,6 +299,7 @@ plain = st.recursive(
 
 
 @given(plain)
+@settings(max_examples=40)
 def test_anything_plain_survives_dump_and_load(value: Any) -> None:
     assert loads_config(dump_config(Scene(anything=value)), Scene).anything == value
 

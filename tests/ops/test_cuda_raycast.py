@@ -19,7 +19,14 @@ from filterlab.ops.cuda import raycast as cuda
 from filterlab.ops.differentiable import raycast
 from filterlab.ops.raycast import Raycast
 from tests.ops.front_end import intermediate
-from tests.ops.test_raycast import AFFINE, described, rays, rays_on_the_last_faces, samples
+from tests.ops.test_raycast import (
+    AFFINE,
+    described,
+    rays,
+    rays_on_the_last_faces,
+    rays_through_a_level_between_cells,
+    samples,
+)
 from tests.test_methods import TENSOR_PRODUCTS
 
 FEW, MANY = 33, 20_000  # the interpreter takes 50 ms for a ray; 33 are more than a program has
@@ -98,6 +105,14 @@ def test_float32_is_rounded_only(method: str, device: str) -> None:
     both = (expected < torch.inf) & (found < torch.inf)
     assert float(((expected < torch.inf) == (found < torch.inf)).double().mean()) > 0.998
     assert float(((expected - found)[both].abs() < 1e-4).double().mean()) > 0.998
+
+
+def test_a_piece_that_begins_where_one_ended_on_the_level_is_told_of(device: str) -> None:
+    given, o, d = rays_through_a_level_between_cells()
+    found = cuda.candidates(on(device, given), o.to(device), d.to(device))
+    order = found.ray.argsort(stable=True)
+    assert found.ray[order].tolist() == [0, 0, 1, 1]
+    assert found.repeated[order].tolist() == [False, True] * 2
 
 
 def test_rays_on_the_last_faces_of_the_domain(device: str) -> None:

@@ -62,6 +62,22 @@ def assert_alike(field: GridField, tolerance: float = 1e-12) -> None:
         assert torch.equal(getattr(mine, name)[order], getattr(all_, name)), name
 
 
+def rays_through_a_level_between_cells() -> tuple[Raycast, Tensor, Tensor]:
+    """Up and down, at samples 0 … 5 with the level 2: one piece ends on it, and the next begins on it."""
+    field = fl.reconstruct(torch.arange(6.0, dtype=torch.float64)[:, None, None].expand(6, 6, 6), "trilinear")
+    origins, directions = torch.tensor([[[2.3, 1.7, -3.0], [2.3, 1.7, 9.0]], [[0, 0, 1], [0, 0, -1]]]).double()
+    return field._raycast(2.0, origins, directions), origins, directions
+
+
+def test_a_piece_that_begins_where_one_ended_on_the_level_is_told_of():
+    given, o, d = rays_through_a_level_between_cells()
+    for way in ("reference", "cpu"):
+        found = raycast.candidates(given, o, d, way)
+        order = found.ray.argsort(stable=True)
+        assert found.ray[order].tolist() == [0, 0, 1, 1]
+        assert found.repeated[order].tolist() == [False, True] * 2
+
+
 @pytest.mark.parametrize("boundary", ["mirror", "zeros"])
 @pytest.mark.parametrize("method", TENSOR_PRODUCTS)
 def test_the_same_hits_and_pieces(method, boundary):
