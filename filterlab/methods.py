@@ -10,7 +10,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from importlib import import_module
 
 import torch
 from torch import Tensor
@@ -20,7 +21,6 @@ from filterlab.arrays import Array
 from filterlab.fields.base import Field
 from filterlab.fields.grid import Coefficients, GridField, Scheme, Term, implementation_of
 from filterlab.fields.ncrsi import NCRSI_TERMS, SevenSamples
-from filterlab.fields.octahedral import QUADRATIC_C1
 from filterlab.fields.storage import named_storage
 from filterlab.fields.tensor_product import (
     Direct,
@@ -34,7 +34,6 @@ from filterlab.fields.tensor_product import (
 )
 from filterlab.fields.tetrahedral import OnTetrahedra, Spline
 from filterlab.fields.tetrahedral_pieces import FieldOnTetrahedra
-from filterlab.fields.type6 import CUBIC_C1, QSS
 from filterlab.kernels import Kernel, PiecewisePolynomial, TensorKernel
 from filterlab.ops.differentiable import gather
 from filterlab.prefilters import Prefilter
@@ -278,16 +277,21 @@ class Tetrahedral(Method):
     inverse of the sampled quadratic B-spline, 1 + ω²/8 + … along every axis, cancels that term: order 3.
 
     Attributes:
-        spline: what is evaluated.
+        made: gives what is evaluated, `spline`.
         continuity: m, it is C^m everywhere.
         prefilter: samples to coefficients.
     """
 
-    spline: Spline
+    made: Callable[[], Spline]
     continuity: int
     prefilter: Prefilter = prefilters.QUADRATIC
     gradients: tuple[str, ...] = ("analytic",)
     schemes: tuple[str, ...] = ("fused", "direct")
+
+    @cached_property
+    def spline(self) -> Spline:
+        """What is evaluated, made when it is first asked for."""
+        return self.made()
 
     @cached_property
     def facts(self) -> Facts:
@@ -351,6 +355,15 @@ def _interpolates(kernel: Kernel, prefilter: Prefilter) -> bool:
         return False
 
 
+def _from_masks(module: str, name: str) -> Spline:
+    """A spline on tetrahedra; to derive its masks, exact fractions, is put off until one is asked for."""
+    return getattr(import_module(f"filterlab.fields.{module}"), name)
+
+
+_QSS = partial(_from_masks, "type6", "QSS")
+_CUBIC_C1 = partial(_from_masks, "type6", "CUBIC_C1")
+_QUADRATIC_C1 = partial(_from_masks, "octahedral", "QUADRATIC_C1")
+
 METHODS: dict[str, Method] = {
     m.name: m
     for m in (
@@ -397,12 +410,12 @@ METHODS: dict[str, Method] = {
             prefilters.CUBIC,
             sampled=EightTrilinearCubic,
         ),
-        Tetrahedral("qss", "prefiltered quadratic super spline on 24 tetrahedra a cube: C1 across cubes", QSS, 0),
-        Tetrahedral("cubic-c1", "prefiltered cubic spline on the same: C1, degree 3 along any ray", CUBIC_C1, 1),
+        Tetrahedral("qss", "prefiltered quadratic super spline on 24 tetrahedra a cube: C1 across cubes", _QSS, 0),
+        Tetrahedral("cubic-c1", "prefiltered cubic spline on the same: C1, degree 3 along any ray", _CUBIC_C1, 1),
         Tetrahedral(
             "quadratic-c1",
             "prefiltered quadratic spline on truncated octahedra: C1, degree 2 along any ray",
-            QUADRATIC_C1,
+            _QUADRATIC_C1,
             1,
         ),
     )

@@ -39,7 +39,6 @@ from filterlab.ops.reference import heights as reference
 from filterlab.surfaces import sight
 from filterlab.surfaces.base import Hits, Surface, check_rays
 from filterlab.surfaces.level_set import RAYS_AT_ONCE
-from filterlab.surfaces.quartic import quartic_spline
 from filterlab.surfaces.relief import Relief
 from filterlab.surfaces.sheets import sheets_of
 from filterlab.volume import Boundary
@@ -86,6 +85,8 @@ class HeightField(Surface):
         prefilter: bool = False,
         nan: str = "refuse",
     ) -> None:
+        from filterlab.surfaces.quartic import quartic_spline  # it derives masks as exact fractions
+
         self.spline = quartic_spline(spline, prefilter)
         if diagonal not in described.DIAGONALS:
             raise ValueError(f"diagonal must be one of {', '.join(described.DIAGONALS)}; got {diagonal!r}")
