@@ -1,22 +1,25 @@
-"""What quadrics and covers look like: the pictures of paper 002, its figures 1, 3 and 7 to 12.
+"""What surfaces of quadrics look like, after the figures of the paper.
 
-    materials   a cover in Phong, reflection lines and toon                                             (1, 7)
-    culling     the balls that are left for the eye, seen from there and from the side                  (3)
-    edges       a block, with the planes that cut balls at edges, and without any; two paraboloids      (8)
-    quads       bilinear quads, and two triangles for each, with their outlines                         (9)
-    levels      level sets of splines as quadrics in their tetrahedra, and walked through               (10)
-    scan        a cover of points from a file, in all materials                                         (1, 7, 11)
-    triangles   reflection lines of a cover, of its first hits alone, of a mesh that is simplified to as
-                large an error, and of marching cubes with no larger one                                (12)
+    materials    a cover in Phong, reflection lines and toon (figures 1, 7, 11)
+    culling      the balls that are left for the eye, seen from there and from the side (3)
+    edges        a block with the planes that cut balls at edges, and without any; two paraboloids, one plane (8)
+    quads        bilinear quads of a twisted column, and two triangles in place of each (9)
+    level-sets   quadrics in tetrahedra of a quadratic super spline, and the walk that stores none (10)
+    triangles    reflection lines of a cover, of its first hits alone, and of a mesh that is simplified until it is as
+                 far off as the cover: whole, and a part of each (12)
 
-Points are drawn here, on a torus and on a block with sharp edges, and covered by `fit_slim`; samples of a jet of fuel
-are made where there is no file of them. Marching cubes are those of the least grid of samples of the torus' distance.
+The cover of the first two is of a scan, where its file is there, else of points drawn on a torus, as that of the last.
+The level sets are one of Marschner and Lobb's signal, and one of a volume: where its file is not there, of a jet of
+droplets that stands in for it.
+
+Source: Stoll, Gumhold & Seidel, Incremental raycasting of piecewise quadratic surfaces on the GPU, 2006.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -25,16 +28,15 @@ from pydantic import Field
 from torch import Tensor
 
 import filterlab as fl
-from experiments import slim_error, triangles
+from experiments import simplified, slim_error
 from experiments.config import ExperimentConfig, VolumeChoice
 from experiments.runs import Record, Run, Unit, timed
-from experiments.simplified import SmoothTriangles, closed_grid, simplified
-from experiments.slim_error import SHAPES, along_normals, unblended
-from filterlab import signals
+from experiments.slim_error import LIFT, SHAPES, along_normals, unblended
 from filterlab.fields.base import Domain
-from filterlab.fields.base import Field as FilterField
+from filterlab.fields.base import Field as Function
+from filterlab.io.config import StrictModel
 from filterlab.io.points import load_points
-from filterlab.render.camera import OrthographicCamera, PerspectiveCamera
+from filterlab.render.camera import PerspectiveCamera
 from filterlab.render.materials import Material, Phong, ReflectionLines, Toon
 from filterlab.render.raycast import raycast
 from filterlab.render.shading import Light
@@ -42,19 +44,18 @@ from filterlab.scenes.model import find_volume
 from filterlab.surfaces import BilinearQuads, LevelSet, Quadrics, Slim, Spheres, Surface, fit_slim
 from filterlab.volume import Volume
 
-MATERIALS: Mapping[str, Callable[[float], Material]] = {
-    "phong": lambda diagonal: Phong((0.82, 0.6, 0.35)),
-    "reflection-lines": lambda diagonal: ReflectionLines((0.3, 0.2, 1.0), 10.0),
-    "toon": lambda diagonal: Toon((0.9, 0.72, 0.45), 3, 0.3, 0.005 * diagonal),
+MATERIALS: Mapping[str, Material] = {
+    "phong": Phong((0.82, 0.6, 0.35)),
+    "reflection-lines": ReflectionLines((0.3, 0.2, 1.0), 10.0),
+    "toon": Toon((0.9, 0.72, 0.45), 3, 0.3),
 }
 PICTURES = {
     "materials": tuple(MATERIALS),
     "culling": ("all", "left", "left-from-the-side"),
-    "edges": ("cut", "not-cut", "two-paraboloids"),
-    "quads": ("bilinear", "two-triangles"),
-    "levels": ("fuel-stored", "fuel-walked", "marschner-lobb-stored", "marschner-lobb-walked"),
-    "scan": tuple(MATERIALS),
-    "triangles": ("cover", "first-hits", "simplified", "marching-cubes"),
+    "edges": ("cut", "not-cut", "paraboloids-cut", "paraboloids-not-cut"),
+    "quads": ("bilinear", "two-triangles", "bilinear-lines", "two-triangles-lines"),
+    "level-sets": ("signal-quadrics", "signal-walk", "volume-quadrics", "volume-walk"),
+    "triangles": ("cover", "simplified", "first-hits", "cover-part", "simplified-part", "first-hits-part"),
 }
 """What there is a picture of, by section."""
 _DIRECTION = (-0.5, 0.7, -0.6)
@@ -62,14 +63,47 @@ _LIGHTS = (Light((0.5, -0.6, 0.8), (0.9, 0.88, 0.85)), Light(None, (0.3, 0.32, 0
 _BACKGROUND = (0.02, 0.022, 0.03)
 _BLOCK = (1.0, 0.7, 0.45)  # half sides
 _HOLE = 0.35  # its radius
-_FEWEST, _FINEST = 8, 96  # samples along an axis, of which triangles are made
-_FINER = 1.5  # times along both ways, than a grid that is as near, is one that is simplified
-_PHONG, _LINES = (MATERIALS[name](0.0) for name in ("phong", "reflection-lines"))
-_FEW_LINES = ReflectionLines((0.3, 0.2, 1.0), 4.0)  # of scans, which are bumpy
-_CLOSE, _NEAR, _ALL = (0.5, 0.5, 0.72, 0.72), (0.2, 0.2, 0.8, 0.8), (0.0, 0.0, 1.0, 1.0)
-_LOWER, _SCANNED = (0.2, 0.3, 0.8, 0.9), (0.12, 0.12, 0.88, 0.88)
-_BLACK = Phong((0.004, 0.004, 0.004), specular=0.0)  # of outlines
-_THIN = 0.018  # radius of outlines
+_BALLS = (0.2, 0.2, 0.8, 0.8)  # of a picture that frames the box of all balls, what the surface takes
+_WHOLE = (0.0, 0.0, 1.0, 1.0)
+_NEARER = (0.12, 0.12, 0.88, 0.88)
+_PART = (0.56, 0.5, 0.68, 0.62)
+_CONTOUR = 3e-3  # of the diagonal
+_FINER = 3  # times as many triangles as a grid has that is as near, before they are simplified
+_TURNED, _STOREYS = 75.0, 3  # degrees that the column turns from one storey to the next
+_LINE = 0.012  # radius of the lines along edges of quads
+
+
+class ScanOf(StrictModel):
+    """Points of a surface.
+
+    Attributes:
+        file: looked for like a volume. Where there is none, a torus is shown.
+        tolerance: of its cover, which smooths its noise.
+        up: the axis that points up in pictures.
+    """
+
+    file: str
+    tolerance: Annotated[float, Field(gt=0, le=0.1)] = 1e-3
+    up: Literal["y", "z"] = "y"
+
+    def path(self) -> str | None:
+        """Of the file; None where there is none."""
+        try:
+            return str(find_volume(self.file))
+        except ValueError:
+            return None
+
+
+class VolumeShown(StrictModel):
+    """A level set of a volume.
+
+    Attributes:
+        volume: its file; where it is optional and not there, another one is shown, at a level of its own.
+        level: in its values.
+    """
+
+    volume: VolumeChoice
+    level: float
 
 
 class Config(ExperimentConfig):
@@ -77,81 +111,90 @@ class Config(ExperimentConfig):
 
     Attributes:
         points: on each shape. tolerance: of covers. size: of pictures, (width, height).
-        scan: a file of points, looked for like a volume. Left out where there is none of that name.
-        scanned_along: the direction that it is looked at along.
-        fuel: samples of a fuel jet; made ones where there are none. fuel_level: that is shown of them, of the largest.
-        samples: along an axis, of made ones and of Marschner and Lobb's signal.
+        scan: that is covered; None: a torus.
+        samples: of Marschner and Lobb's signal along an axis, and of the jet.
+        volume: whose level set is shown; None: that of the jet.
     """
 
     experiment: Literal["quadrics_gallery"]
     points: Annotated[int, Field(ge=500, le=10**6)] = 12_000
     tolerance: Annotated[float, Field(gt=0, le=0.1)] = 3e-4
     size: tuple[Annotated[int, Field(ge=4, le=4096)], Annotated[int, Field(ge=4, le=4096)]] = (480, 400)
-    scan: str | None = None
-    scanned_along: tuple[float, float, float] = (0.3, -0.25, -1.0)
-    fuel: VolumeChoice | None = None
-    fuel_level: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    samples: Annotated[int, Field(ge=6, le=256)] = 41
+    scan: ScanOf | None = None
+    samples: Annotated[int, Field(ge=8, le=512)] = 41
+    volume: VolumeShown | None = None
+
+
+def check(config: Config, path: str = "") -> None:
+    """Raises ConfigError unless the volume is sound, or optional and not here."""
+    if config.volume is not None and config.volume.volume.present:
+        config.volume.volume.check(f"{path}volume.volume")
 
 
 def units(config: Config) -> list[Unit]:
     """One per picture."""
     seconds = config.points * 1e-4 + config.size[0] * config.size[1] * 2e-5
-    pictures = {part: names for part, names in PICTURES.items() if part != "scan" or _scan_file(config)}
-    return [Unit(f"{part}/{name}", f"{part}, {name}", seconds) for part, names in pictures.items() for name in names]
-
-
-class Shown(NamedTuple):
-    """What a picture is of.
-
-    Attributes:
-        told: what its record says besides. outlines: lines upon the surface.
-    """
-
-    surface: Surface
-    material: Material
-    camera: PerspectiveCamera | OrthographicCamera
-    told: Record
-    outlines: Surface | None = None
-
-    def image(self, size: tuple[int, int]) -> Tensor:
-        """(H, W, 3) linear RGB."""
-        seen = _cast(self.surface, self.camera, self.material, size)
-        if self.outlines is None:
-            return seen["color"][..., :3]
-        lines = _cast(self.outlines, self.camera, _BLACK, size)
-        return torch.where(lines["depth"] < seen["depth"], lines["color"], seen["color"])[..., :3]
-
-
-def _cast(surface: Surface, camera: PerspectiveCamera | OrthographicCamera, material: Material, size: tuple[int, int]):
-    shown = {"size": size, "lights": _LIGHTS, "background": _BACKGROUND, "channels": ("color", "depth")}
-    made = raycast(surface, camera, material, **shown)
-    assert isinstance(made, dict)
-    return made
+    return [Unit(f"{part}/{name}", f"{part}, {name}", seconds) for part, names in PICTURES.items() for name in names]
 
 
 def compute(config: Config, unit: Unit, run: Run) -> Record:
     """The record of one picture, and its file."""
     part, name = unit.key.split("/")
-    shown = _PARTS[part](config, name, run)
-    image, seconds = timed(lambda: shown.image(config.size))
-    saved = run.save_image(f"{part}-{name}", image)
-    return {"part": part, "name": name, "image": saved, "files": [saved], "seconds": seconds, **shown.told}
+    made = _PARTS[part](config, name, run)
+    image, seconds = timed(lambda: _picture(config, made.surface, made.camera, made.material))
+    saved = run.save_image(f"{part}-{name}", image if made.lines is None else _drawn_over(config, image, made))
+    return {"part": part, "name": name, "image": saved, "files": [saved], "seconds": seconds, **made.told}
 
 
-def _materials(config: Config, name: str, run: Run) -> Shown:
-    slim = _torus(config, run)
-    return Shown(slim, MATERIALS[name](slim.domain.diagonal), _camera(config, slim.domain), {"balls": len(slim)})
+class Made(NamedTuple):
+    """What a picture is of, what its record tells, and lines that are drawn over it."""
+
+    surface: Surface
+    material: Material
+    camera: PerspectiveCamera
+    told: Record
+    lines: Quadrics | None = None
 
 
-def _culling(config: Config, name: str, run: Run) -> Shown:
-    slim = _torus(config, run)
-    camera = _camera(config, slim.domain)
+def _picture(config: Config, surface: Surface, camera: PerspectiveCamera, material: Material) -> Tensor:
+    image = raycast(surface, camera, material, size=config.size, lights=_LIGHTS, background=_BACKGROUND, subpixels=2)
+    assert isinstance(image, Tensor)
+    return image[..., :3]
+
+
+def _drawn_over(config: Config, image: Tensor, made: Made) -> Tensor:
+    """An image with black lines, where nothing of the surface is in front of them."""
+    assert made.lines is not None
+    surface, lines = (_depth(config, x, made.camera) for x in (made.surface, made.lines))
+    return torch.where(lines < surface, 0.0, image)
+
+
+def _depth(config: Config, surface: Surface, camera: PerspectiveCamera) -> Tensor:
+    found = raycast(surface, camera, size=config.size, channels=("depth",))
+    assert isinstance(found, dict)
+    return found["depth"]
+
+
+def _materials(config: Config, name: str, run: Run) -> Made:
+    cover = _cover(config, run)
+    material, size = MATERIALS[name], math.dist(cover.slim.domain.lower, cover.slim.domain.upper)
+    if isinstance(material, Toon):
+        material = replace(material, contour=_CONTOUR * size)
+    return Made(cover.slim, material, cover.camera(config), {"shown": cover.name, **_balls(cover.slim)})
+
+
+def _balls(slim: Slim) -> Record:
+    return {"balls": len(slim)}
+
+
+def _culling(config: Config, name: str, run: Run) -> Made:
+    cover = _cover(config, run)
+    slim, camera = cover.slim, cover.camera(config)
     left = slim.seen_from(torch.tensor(camera.position, dtype=torch.float64))
-    side = _camera(config, slim.domain, (0.7, 0.5, -0.6))
+    side = cover.camera(config, (0.7, 0.5, -0.6))
     surface = slim if name == "all" else left
-    told = {"balls": len(slim), "left": int(_seen(slim, camera).sum())}
-    return Shown(surface, _PHONG, side if name == "left-from-the-side" else camera, told)
+    told = {"shown": cover.name, **_balls(slim), "left": int(_seen(slim, camera).sum())}
+    return Made(surface, MATERIALS["phong"], side if name == "left-from-the-side" else camera, told)
 
 
 def _seen(slim: Slim, camera: PerspectiveCamera) -> Tensor:
@@ -160,105 +203,60 @@ def _seen(slim: Slim, camera: PerspectiveCamera) -> Tensor:
     return each.facing(torch.tensor(camera.position, dtype=torch.float64))
 
 
-def _edges(config: Config, name: str, run: Run) -> Shown:
-    if name == "two-paraboloids":
-        surface = paraboloids()
-        camera = _camera(config, surface.domain, (0.15, 0.75, -0.6), _LOWER)
-        return Shown(surface, _PHONG, camera, {"balls": len(surface)})
+def _edges(config: Config, name: str, run: Run) -> Made:
+    if name.startswith("paraboloids"):
+        surface = paraboloids(cut=name == "paraboloids-cut")
+        return Made(surface, MATERIALS["phong"], _camera(config, surface.domain, (-0.25, 0.9, -0.45)), {"quadrics": 2})
     slim = run.memo("block", lambda: fit_slim(*block(config.points, config.seed), config.tolerance))
     surface = slim if name == "cut" else Slim(*slim.tensors)
     assert slim.fit is not None
-    told = {"balls": len(slim), "sharp": slim.fit.sharp}
-    return Shown(surface, _PHONG, _camera(config, slim.domain), told)
+    return Made(surface, MATERIALS["phong"], _camera(config, slim.domain), {**_balls(slim), "sharp": slim.fit.sharp})
 
 
-def _quads(config: Config, name: str, run: Run) -> Shown:
-    vertices, quads = net(config.seed)
-    outlines = _tubes(vertices, quads)
-    if name == "two-triangles":
-        quads = torch.cat((quads[:, [0, 1, 2, 2]], quads[:, [0, 2, 3, 3]]))
-    surface = BilinearQuads(vertices, quads)
-    camera = _camera(config, surface.domain, (-0.5, 0.75, -0.75), _ALL)
-    return Shown(surface, _PHONG, camera, {name.split("-")[-1]: len(surface)}, outlines)
+def _quads(config: Config, name: str, run: Run) -> Made:
+    vertices, quads = column()
+    shown = quads if name.startswith("bilinear") else torch.cat((quads[:, [0, 1, 2, 2]], quads[:, [0, 2, 3, 3]]))
+    surface = BilinearQuads(vertices, shown)
+    material = MATERIALS["reflection-lines" if name.endswith("lines") else "phong"]
+    camera = _camera(config, surface.domain, (-0.5, 0.8, -0.35), _NEARER)
+    return Made(surface, material, camera, {"quads": len(shown)}, along_edges(vertices, quads))
 
 
-def _levels(config: Config, name: str, run: Run) -> Shown:
-    data, kind = name.rsplit("-", 1)
-    field, level = run.memo(data, lambda: _FIELDS[data](config))
-    camera = _camera(config, field.domain, *_LEVELS[data])
-    walked = LevelSet(field, level)
-    if kind == "walked":
-        return Shown(walked, _PHONG, camera, {})
-    stored, seconds = timed(lambda: Quadrics.of_level_set(field, level))
-    told = {
-        "tetrahedra": len(stored),
-        "stored_seconds": seconds,
-        "differ": _differ(walked, stored, camera, config.size),
-    }
-    return Shown(stored, _PHONG, camera, told)
+def _level_sets(config: Config, name: str, run: Run) -> Made:
+    which, how = name.split("-")
+    field, level, told = run.memo(f"field:{which}", lambda: _field(config, which))
+    made, seconds = run.memo(f"stored:{which}", lambda: timed(lambda: Quadrics.of_level_set(field, level)))
+    camera = _camera(config, made.domain, (-0.5, 0.6, -0.45), _WHOLE if which == "signal" else _NEARER)
+    if how == "walk":
+        return Made(LevelSet(field, level), MATERIALS["phong"], camera, {**told, "walk": True})
+    size = sum(x.numel() * x.element_size() for x in (*made.tensors, made.bounds.planes))
+    return Made(made, MATERIALS["phong"], camera, {**told, "tetrahedra": len(made), "bytes": size, "stored": seconds})
 
 
-def _differ(one: Surface, other: Surface, camera: PerspectiveCamera, size: tuple[int, int]) -> int:
-    """How many pixels see one alone, or both at places more than 1e-9 of their distance apart."""
-    rays = [x.double() for x in camera.rays(*size)]
-    a, b = (surface.hit(*rays).t for surface in (one, other))
-    return int(((a - b).abs() > 1e-9 * b.abs()).logical_or((a < torch.inf) != (b < torch.inf)).sum())
+def _field(config: Config, which: str) -> tuple[Function, float, Record]:
+    """The spline, its level, and what is told of it."""
+    if which == "signal":
+        volume, level, shown = fl.signals.marschner_lobb().sample(config.samples), 0.5, "Marschner-Lobb"
+    elif config.volume is not None and config.volume.volume.present:
+        volume, level = config.volume.volume.load(), config.volume.level
+        shown = config.volume.volume.file
+    else:
+        volume, level, shown = jet(config.samples), 0.5, "jet"
+    return fl.reconstruct(volume, "qss"), level, {"shown": shown, "samples": list(volume.size)}
 
 
-def _fuel(config: Config) -> tuple[FilterField, float]:
-    given = config.fuel is not None and config.fuel.present
-    volume = config.fuel.load() if config.fuel is not None and given else jet(config.samples)
-    return fl.reconstruct(volume.to(torch.float64), "qss"), config.fuel_level * float(volume.samples.max())
-
-
-def _marschner_lobb(config: Config) -> tuple[FilterField, float]:
-    return fl.reconstruct(signals.marschner_lobb().sample(config.samples, dtype=torch.float64), "qss"), 0.5
-
-
-_FIELDS = {"fuel": _fuel, "marschner-lobb": _marschner_lobb}
-_LEVELS = {  # directions they are looked at along, and what is seen
-    "fuel": ((-0.6, 0.7, -0.5), (0.28, 0.22, 0.82, 0.76)),
-    "marschner-lobb": ((-0.3, 0.35, -0.9), (0.13, 0.13, 0.87, 0.87)),
-}
-
-
-def _scan(config: Config, name: str, run: Run) -> Shown:
-    def made() -> Slim:
-        points, normals = load_points(find_volume(str(config.scan)))
-        return fit_slim(points, normals, config.tolerance, seed=config.seed)
-
-    slim = run.memo("scan", made)
-    material = _FEW_LINES if name == "reflection-lines" else MATERIALS[name](slim.domain.diagonal)
-    up = (0.0, 1.0, 0.0)
-    camera = PerspectiveCamera.framing(
-        slim.domain, config.scanned_along, up=up, aspect=config.size[0] / config.size[1], window=_SCANNED
-    )
-    return Shown(slim, material, camera, {"balls": len(slim)})
-
-
-def _scan_file(config: Config) -> bool:
-    try:
-        return config.scan is not None and find_volume(config.scan).exists()
-    except ValueError:
-        return False
-
-
-def _triangles(config: Config, name: str, run: Run) -> Shown:
-    slim, seen = _torus(config, run), SHAPES["torus"].draw(2000, config.seed + 1)
-    rms = _off(slim, seen)
-    surface = {
-        "cover": lambda: slim,
-        "first-hits": lambda: unblended(slim),
-        "simplified": lambda: _simplified(rms, seen),
-        "marching-cubes": lambda: mesh_as_near(rms, seen),
-    }[name]()
-    count = {"balls": len(surface)} if isinstance(surface, Slim) else {"triangles": _count(surface)}
-    camera = _camera(config, slim.domain, window=_CLOSE)
-    return Shown(surface, _LINES, camera, {**count, "rms": _off(surface, seen)})
-
-
-def _count(mesh: triangles.Triangles | SmoothTriangles) -> int:
-    return len(mesh.mesh.faces) if isinstance(mesh, triangles.Triangles) else len(mesh)
+def _triangles(config: Config, name: str, run: Run) -> Made:
+    slim, shape = _torus(config, run), SHAPES["torus"]
+    seen = shape.draw(2000, config.seed + 1)
+    window = _PART if name.endswith("part") else _BALLS
+    camera, material = _camera(config, slim.domain, window=window), MATERIALS["reflection-lines"]
+    if not name.startswith("simplified"):
+        surface = slim if name.startswith("cover") else unblended(slim)
+        return Made(surface, material, camera, {**_balls(slim), "rms": along_normals(shape, surface, seen)[0]})
+    rms = along_normals(shape, slim, seen)[0]
+    fewest = lambda: simplified.as_near(*_fine(rms), rms, lambda mesh: _off(mesh, seen))  # noqa: E731
+    mesh, off = run.memo("mesh", fewest)
+    return Made(mesh, material, camera, {"triangles": len(mesh), "rms": off})
 
 
 _PARTS = {
@@ -266,10 +264,30 @@ _PARTS = {
     "culling": _culling,
     "edges": _edges,
     "quads": _quads,
-    "levels": _levels,
-    "scan": _scan,
+    "level-sets": _level_sets,
     "triangles": _triangles,
 }
+
+
+class _Cover(NamedTuple):
+    """What is shown of materials and culling."""
+
+    slim: Slim
+    name: str
+    up: str
+    window: tuple[float, float, float, float]
+
+    def camera(self, config: Config, direction: tuple[float, float, float] = _DIRECTION) -> PerspectiveCamera:
+        return _camera(config, self.slim.domain, direction, self.window, self.up)
+
+
+def _cover(config: Config, run: Run) -> _Cover:
+    scan = config.scan
+    path = None if scan is None else scan.path()
+    if scan is None or path is None:
+        return _Cover(_torus(config, run), "torus", "z", _BALLS)
+    slim = run.memo("scan", lambda: fit_slim(*load_points(path), scan.tolerance, seed=config.seed))
+    return _Cover(slim, scan.file, scan.up, _NEARER)
 
 
 def _torus(config: Config, run: Run) -> Slim:
@@ -283,11 +301,12 @@ def _camera(
     config: Config,
     domain: Domain,
     direction: tuple[float, float, float] = _DIRECTION,
-    window: tuple[float, float, float, float] = _NEAR,
+    window: tuple[float, float, float, float] = _BALLS,
+    up: str = "z",
 ) -> PerspectiveCamera:
-    """The box that is framed may be that of balls: as a rule less of it is looked at."""
-    aspect = config.size[0] / config.size[1]
-    return PerspectiveCamera.framing(domain, direction, aspect=aspect, window=window)
+    x, y, z = direction
+    way, vertical = (direction, (0.0, 0.0, 1.0)) if up == "z" else ((x, z, -y), (0.0, 1.0, 0.0))
+    return PerspectiveCamera.framing(domain, way, up=vertical, aspect=config.size[0] / config.size[1], window=window)
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------------
@@ -312,71 +331,63 @@ def block(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return points[kept], normals[kept]
 
 
-def paraboloids() -> Slim:
-    """Two balls at one place, each with a paraboloid that a plane between them cuts off: figure 8."""
-    bent = torch.diag(torch.tensor([0.35, 0.35, 0.0], dtype=torch.float64))
-    side = torch.tensor([[0.45, 0.0, 0.5], [-0.45, 0.0, 0.5]], dtype=torch.float64)
-    cuts = torch.tensor([[[-1.0, 0, 0, 0]], [[1.0, 0, 0, 0]]], dtype=torch.float64)
-    one = torch.ones(2, dtype=torch.float64)
-    return Slim(cuts[:, 0, :3] * 0, one, bent.expand(2, 3, 3), side, 0 * one, cuts=cuts, faces="both")
+def paraboloids(cut: bool) -> Quadrics:
+    """Two that meet at an angle above the y axis, in a ball each, cut by the plane between them or not."""
+    A = torch.diag(torch.tensor([0.35, 0.35, 0.0], dtype=torch.float64)).expand(2, 3, 3)
+    b = torch.tensor([[0.3, 0.0, 0.5], [-0.3, 0.0, 0.5]], dtype=torch.float64)
+    centers = torch.tensor([[0.35, 0.0, -0.2], [-0.35, 0.0, -0.2]], dtype=torch.float64)
+    planes = torch.tensor([[[-1.0, 0, 0, 0]], [[1.0, 0, 0, 0]]], dtype=torch.float64)
+    radii = torch.full((2,), 0.9, dtype=torch.float64)
+    return Quadrics(A, b, torch.zeros(2), Spheres(centers, radii), cuts=planes if cut else None)
 
 
-def net(seed: int) -> tuple[Tensor, Tensor]:
-    """Vertices and quads of a net of four by three, bent at random."""
-    drawn = np.random.default_rng(seed)
-    x, y = np.meshgrid(np.arange(5.0), np.arange(4.0), indexing="ij")
-    corners = np.stack((x, y, 1.1 * drawn.uniform(-0.5, 0.5, x.shape)), -1)
-    corners[..., :2] += drawn.uniform(-0.15, 0.15, (*x.shape, 2))
-    number = np.arange(x.size).reshape(x.shape)
-    quads = np.stack((number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), -1)
-    return torch.from_numpy(corners.reshape(-1, 3)), torch.from_numpy(quads.reshape(-1, 4))
+def column() -> tuple[Tensor, Tensor]:
+    """Vertices (V, 3) and quads (Q, 4), all around outside, of a square column that turns from storey to storey."""
+    angles = torch.arange(4) * (torch.pi / 2) + torch.arange(_STOREYS + 1)[:, None] * math.radians(_TURNED)
+    height = torch.arange(_STOREYS + 1.0)[:, None].expand(-1, 4)
+    vertices = torch.stack((angles.cos(), angles.sin(), 0.9 * height), -1).double().flatten(0, 1)
+    at = lambda storey, corner: 4 * storey + corner % 4  # noqa: E731
+    sides = [[at(s, k), at(s, k + 1), at(s + 1, k + 1), at(s + 1, k)] for s in range(_STOREYS) for k in range(4)]
+    ends = [[at(0, k) for k in (3, 2, 1, 0)], [at(_STOREYS, k) for k in range(4)]]
+    return vertices, torch.tensor(sides + ends)
 
 
-def _tubes(vertices: Tensor, quads: Tensor) -> Quadrics:
-    """Thin ones along all edges."""
-    edges = torch.stack((quads, quads.roll(-1, 1)), -1).reshape(-1, 2).sort(1).values.unique(dim=0)
-    return Quadrics.cylinders(vertices[edges[:, 0]], vertices[edges[:, 1]], vertices.new_full((len(edges),), _THIN))
+def along_edges(vertices: Tensor, quads: Tensor) -> Quadrics:
+    """Thin tubes."""
+    ends = torch.stack((quads, quads.roll(-1, 1)), -1).flatten(0, 1).sort(1).values.unique(dim=0)
+    starts, stops = vertices[ends].unbind(1)
+    return Quadrics.cylinders(starts, stops, torch.full((len(ends),), _LINE, dtype=torch.float64))
 
 
-def jet(n: int) -> fl.Volume:
-    """n³ samples in [-1, 1]³ of what a jet of fuel may look like: a cone along x that breaks up into drops."""
-    axis = torch.linspace(-1, 1, n, dtype=torch.float64)
-    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-    along = x + 0.7
-    width = 0.06 + 0.28 * along.clamp_min(0)
-    drops = 1 + 0.45 * torch.sin(9 * x) * torch.cos(7 * torch.atan2(y, z)) * (along / 1.4).clamp(0, 1)
-    value = torch.exp(-(y * y + z * z) / width**2) * drops * torch.exp(-((along.clamp_min(0) / 0.9) ** 4))
-    value = value * torch.sigmoid(30 * along)
-    return fl.Volume(value, spacing=(2 / (n - 1),) * 3, origin=(-1.0,) * 3)
-
-
-def _simplified(rms: float, seen: np.ndarray) -> SmoothTriangles:
-    """Edges of a fine grid on the torus collapse until it is as far off."""
-    shape = SHAPES["torus"]
-    rows, columns = (math.ceil(_FINER * n) for n in slim_error.as_near(shape, rms))
-    at = np.stack(np.meshgrid(np.arange(rows) / rows, np.arange(columns) / columns, indexing="ij"), -1)
-    return simplified(*closed_grid(torch.from_numpy(shape.at(at))), lambda mesh: _off(mesh, seen), rms)
-
-
-def mesh_as_near(rms: float, seen: np.ndarray) -> triangles.Triangles:
-    """Marching cubes of the least number of samples whose rms distance, in diagonals, is at most that."""
-    low, high = _FEWEST, _FINEST
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if _off(_mesh(middle), seen) <= rms else (middle, high)
-    return _mesh(high)
-
-
-def _mesh(n: int) -> triangles.Triangles:
-    half = 1.1 * (slim_error.RING + slim_error.TUBE)
-    axis = np.linspace(-half, half, n)
+def jet(n: int) -> Volume:
+    """n³ samples of a cone of spray that breaks up into droplets, where no file of a volume is here."""
+    drawn = np.random.default_rng(4)
+    axis = np.linspace(-1, 1, n)
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
-    off = SHAPES["torus"].distance(np.stack((x, y, z), -1).reshape(-1, 3)).reshape(n, n, n)
-    spacing = 2 * half / (n - 1)
-    volume = Volume(torch.from_numpy(-off), spacing=(spacing,) * 3, origin=(-half,) * 3)
-    return triangles.marching_cubes(volume, 0.0, "border")
+    spread = 0.1 + 0.22 * (z + 1)
+    value = np.exp(-((np.hypot(x, y) - spread) ** 2) / (2 * 0.07**2)) * (z < 0.3)
+    for height in drawn.uniform(0.0, 0.9, 60):
+        angle, away = drawn.uniform(0, 2 * np.pi), (0.1 + 0.22 * (height + 1)) * drawn.normal(1, 0.12)
+        at = (x - away * np.cos(angle)) ** 2 + (y - away * np.sin(angle)) ** 2 + (z - height) ** 2
+        value = np.maximum(value, np.exp(-at / (2 * drawn.uniform(0.04, 0.09) ** 2)))
+    return Volume(torch.from_numpy(value), spacing=(2 / (n - 1),) * 3, origin=(-1.0,) * 3)
 
 
-def _off(surface: Surface, seen: np.ndarray) -> float:
-    """The rms distance from the torus, in diagonals."""
-    return along_normals(SHAPES["torus"], surface, seen)[0]
+def _fine(rms: float) -> tuple[np.ndarray, np.ndarray]:
+    """A grid of triangles on the torus, all vertices on it, that is closer to it by far."""
+    rows, columns = (max(3, round(n * math.sqrt(_FINER))) for n in slim_error.as_near(SHAPES["torus"], rms))
+    i, k = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+    at = lambda i, k: (i % rows) * columns + k % columns  # noqa: E731
+    corners = at(i, k), at(i + 1, k), at(i + 1, k + 1), at(i, k + 1)
+    faces = np.stack([np.stack([corners[n] for n in some], -1) for some in ((0, 1, 2), (0, 2, 3))], 2).reshape(-1, 3)
+    vertices = SHAPES["torus"].at(np.stack((i / rows, k / columns), -1).reshape(-1, 2))
+    return np.asfortranarray(vertices), np.asfortranarray(faces)
+
+
+def _off(mesh: Surface, seen: np.ndarray) -> float:
+    shape = SHAPES["torus"]
+    lift = LIFT * shape.diagonal
+    p, n = torch.from_numpy(seen), torch.from_numpy(shape.normal(seen))
+    t = mesh.hit(p + lift * n, -n).t
+    off = t[t < torch.inf] - lift
+    return float(off.square().mean().sqrt()) / shape.diagonal

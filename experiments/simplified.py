@@ -1,88 +1,72 @@
-"""Meshes that are simplified to an error: edges collapse where quadric errors are least (libigl), normals are shaded.
+"""Triangles as most programs show them: a fine mesh, simplified until it is as far off as it may be, shaded smoothly.
 
-Rays meet the triangles exactly; normals go from vertex to vertex, as in any picture of a mesh.
+    fine mesh ─▶ libigl's qslim ─▶ the fewest triangles whose rms distance is small enough ─▶ normals between corners
+
+Rays hit the triangles exactly: each is a bilinear quad with two corners in one place. Normals at vertices are means of
+those of the triangles around, weighted by area.
 
 Source: Garland & Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, as_tensor
 from filterlab.signed_distances import libigl
 from filterlab.surfaces import BilinearQuads, Hits, SurfacePoints
 
-_APART = 1.05  # two numbers of triangles that are as good as one
-_FEWER = 16  # times, at most
+_ROUNDS = 3  # until the number of triangles is that of the distance that is asked for, to some percent
 
 
 class SmoothTriangles(BilinearQuads):
-    """Triangles with normals between those of vertices, which are the means of their triangles' by area.
-
-    Args:
-        vertices: (V, 3) float64. triangles: (T, 3) int64, counterclockwise from outside.
-    """
+    """Triangles (F, 3) between vertices (V, 3), whose normals are interpolated between normals (V, 3) at vertices."""
 
     max_order = 1
 
-    def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
-        super().__init__(torch.from_numpy(vertices), torch.from_numpy(triangles[:, [0, 1, 2, 2]]))
-        igl = libigl()
-        self._normals = torch.from_numpy(
-            igl.per_vertex_normals(vertices, triangles, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA)
-        )
+    def __init__(self, vertices: Tensor, faces: Tensor, normals: Tensor) -> None:
+        super().__init__(vertices, torch.cat((faces, faces[:, 2:]), 1))
+        self.normals = normals
 
-    def at(self, origins: Array, directions: Array, hit: Hits, order: int = 1) -> SurfacePoints:
-        """Points, and normals between vertices; of first hits alone."""
-        known = super().at(origins, directions, hit, 0)
+    @classmethod
+    def of(cls, vertices: np.ndarray, faces: np.ndarray) -> SmoothTriangles:
+        """With normals of the mesh itself."""
+        normals = libigl().per_vertex_normals(vertices, faces)
+        return cls(*(torch.from_numpy(np.ascontiguousarray(x)) for x in (vertices, faces.astype(np.int64), normals)))
+
+    @torch.no_grad()
+    def at(self, origins: Tensor, directions: Tensor, hit: Hits, order: int = 1) -> SurfacePoints:
+        """Points, and normals between those at corners."""
+        found = super().at(origins, directions, hit, order=0)
         if not order or hit.piece is None:
-            return known
-        u, v = self.parameters(as_tensor(origins), as_tensor(directions), hit).double()[..., None].unbind(-2)
-        a, b, c, _ = self._normals[self.quads[hit.piece.clamp_min(0)]].unbind(-2)
-        normal = torch.nn.functional.normalize((1 - v) * ((1 - u) * a + u * b) + v * c, dim=-1)
-        normal = torch.where(hit.valid[..., None], normal, 0).to(known.point.dtype)
-        return SurfacePoints(known.point, normal, normal)
+            return found
+        u, v = super().parameters(origins, directions, hit).unbind(-1)
+        weights = torch.stack(((1 - u) * (1 - v), u * (1 - v), v), -1)
+        corners = self.normals[self.quads[hit.piece.clamp_min(0), :3]].to(weights)
+        normal = torch.nn.functional.normalize((weights[..., None] * corners).sum(-2), dim=-1)
+        normal = torch.where(hit.valid[..., None], normal, 0)
+        return SurfacePoints(found.point, normal, normal)
 
 
-def simplified(
-    vertices: np.ndarray, triangles: np.ndarray, error: Callable[[SmoothTriangles], float], wanted: float
-) -> SmoothTriangles:
-    """A mesh with about the fewest triangles whose error is no larger than wanted; the given one if its own is.
+def as_near(
+    vertices: np.ndarray, faces: np.ndarray, rms: float, off: Callable[[SmoothTriangles], float]
+) -> tuple[SmoothTriangles, float]:
+    """The fewest triangles, to some percent, that `off` says to be as near as `rms`, of a fine mesh; and how near.
 
-    Args:
-        vertices, triangles: of a fine closed mesh. error: falls as triangles become more.
+    Distances go with 1 / number of triangles, so that each try tells the next. Raises ValueError: the fine mesh is no
+    nearer.
     """
-    found, low = SmoothTriangles(vertices, triangles), len(triangles) / _FEWER
-    while len(found) > _APART * low:
-        middle = math.sqrt(low * len(found))
-        mesh = _collapsed(found, int(middle))
-        if error(mesh) > wanted:
-            low = middle
-        elif len(mesh) < len(found):
-            found = mesh
-        else:
-            break
-    return found
-
-
-def _collapsed(mesh: SmoothTriangles, count: int) -> SmoothTriangles:
-    vertices = np.asfortranarray(mesh.vertices.numpy())
-    triangles = np.asfortranarray(mesh.quads[:, :3].numpy(), dtype=np.int32)
-    left, own, *_ = libigl().qslim(vertices, triangles, count)
-    return SmoothTriangles(np.ascontiguousarray(left), np.ascontiguousarray(own))
-
-
-def closed_grid(points: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a grid (N, M, 3) that goes round both ways."""
-    rows, columns = points.shape[:2]
-    number = torch.arange(rows * columns).reshape(rows, columns)
-    right, below = number.roll(-1, 1), number.roll(-1, 0)
-    across = below.roll(-1, 1)
-    corners = torch.stack((number, below, across, number, across, right), -1)
-    return points.reshape(-1, 3).numpy(), corners.reshape(-1, 3).numpy()
+    fine = SmoothTriangles.of(vertices, faces)
+    if (own := off(fine)) > rms:
+        raise ValueError(f"expected a fine mesh nearer than {rms:g}; got one of {len(faces)} triangles, {own:g} off")
+    best, count = (fine, own), len(faces) // 8
+    for _ in range(_ROUNDS):
+        simpler = SmoothTriangles.of(*libigl().qslim(vertices, faces.astype(np.int32), max_m=count)[:2])
+        now = off(simpler)
+        if now <= rms and len(simpler) < len(best[0]):
+            best = simpler, now
+        count = min(len(faces) - 1, round(1.02 * count * now / rms))
+    return best

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ from experiments.runs import Record, Run, Unit, timed
 from filterlab.io.config import ConfigError, Problem, StrictModel
 from filterlab.io.points import load_points
 from filterlab.scenes.model import find_volume
-from filterlab.surfaces import Slim, Surface, fit_slim
+from filterlab.surfaces import Slim, fit_slim
 
 SECONDS_PER_POINT = 4e-4
 LIFT = 0.05  # diagonals above the surface, where rays begin
@@ -155,11 +156,11 @@ def unblended(slim: Slim) -> Slim:
 
 
 @torch.no_grad()
-def along_normals(shape: Shape, surface: Surface, points: np.ndarray) -> tuple[float, int]:
+def along_normals(shape: Shape, slim: Slim, points: np.ndarray) -> tuple[float, int]:
     """The rms distance of hits of rays down the normals of points from them, in diagonals; how many rays miss."""
     lift = LIFT * shape.diagonal
     p, n = torch.from_numpy(points), torch.from_numpy(shape.normal(points))
-    t = surface.hit(p + lift * n, -n).t
+    t = slim.hit(p + lift * n, -n).t
     hit = (t - lift).abs() < lift / 2
     return float((t[hit] - lift).square().mean().sqrt()) / shape.diagonal, int((~hit).sum())
 
@@ -186,7 +187,12 @@ class Shape(NamedTuple):
     @property
     def diagonal(self) -> float:
         """Of its box."""
-        return float(np.linalg.norm(np.ptp(self.at(np.random.default_rng(0).uniform(size=(100_000, 2))), 0)))
+        return _diagonal(self)
+
+
+@cache
+def _diagonal(shape: Shape) -> float:
+    return float(np.linalg.norm(np.ptp(shape.at(np.random.default_rng(0).uniform(size=(100_000, 2))), 0)))
 
 
 def off_grid(shape: Shape, quads: int) -> float:

@@ -344,7 +344,7 @@ def tiny(name, scan):
         "rays": 20,
         "orders": [2],
     }
-    configs["quadrics_gallery"] = {"points": 500, "tolerance": 1e-2, "size": [12, 10], "samples": 6}
+    configs["quadrics_gallery"] = {"points": 500, "tolerance": 1e-2, "size": [12, 10], "samples": 10}
     configs["inverse_slim"] = {
         "target_balls": 100,
         "balls": 60,
