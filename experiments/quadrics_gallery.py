@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -218,7 +219,7 @@ def _quads(config: Config, name: str, run: Run) -> Made:
     shown = quads if name.startswith("bilinear") else torch.cat((quads[:, [0, 1, 2, 2]], quads[:, [0, 2, 3, 3]]))
     surface = BilinearQuads(vertices, shown)
     material = MATERIALS["reflection-lines" if name.endswith("lines") else "phong"]
-    camera = _camera(config, surface.domain, (-0.5, 0.8, -0.35), _NEARER)
+    camera = _camera(config, surface.domain, (-0.5, 0.8, -0.35), _WHOLE)
     return Made(surface, material, camera, {"quads": len(shown)}, along_edges(vertices, quads))
 
 
@@ -239,7 +240,7 @@ def _field(config: Config, which: str) -> tuple[Function, float, Record]:
         volume, level, shown = fl.signals.marschner_lobb().sample(config.samples), 0.5, "Marschner-Lobb"
     elif config.volume is not None and config.volume.volume.present:
         volume, level = config.volume.volume.load(), config.volume.level
-        shown = config.volume.volume.file
+        shown = Path(config.volume.volume.file).name
     else:
         volume, level, shown = jet(config.samples), 0.5, "jet"
     return fl.reconstruct(volume, "qss"), level, {"shown": shown, "samples": list(volume.size)}
@@ -287,7 +288,7 @@ def _cover(config: Config, run: Run) -> _Cover:
     if scan is None or path is None:
         return _Cover(_torus(config, run), "torus", "z", _BALLS)
     slim = run.memo("scan", lambda: fit_slim(*load_points(path), scan.tolerance, seed=config.seed))
-    return _Cover(slim, scan.file, scan.up, _NEARER)
+    return _Cover(slim, Path(path).name, scan.up, _NEARER)
 
 
 def _torus(config: Config, run: Run) -> Slim:

@@ -13,7 +13,7 @@ from filterlab import reconstruct, resample
 from filterlab.methods import METHODS
 from filterlab.ops.differentiable.prefilter import implementation_for, prefilter_samples
 from filterlab.prefilters import PREFILTERS
-from filterlab.render import Light, PerspectiveCamera, Shading, TransferFunction, render
+from filterlab.render import Light, PerspectiveCamera, Phong, Shading, Silhouettes, TransferFunction, raycast, render
 from filterlab.roots import all_roots, first_root
 from filterlab.surfaces import HeightField, LevelSet, Quadrics, Slim, Surface
 from filterlab.surfaces.quartic import SPLINES as QUARTIC
@@ -264,3 +264,34 @@ def test_covers(faces: str) -> None:
         surface = Slim(c, *(x.to(device) for x in rest), faces=faces)
         results.append(_of_surface(surface, c, origins.to(device), (ends - origins).to(device)))
     _assert_all_same(*results, 1e-8)
+
+
+def _surface_of(kind: str, device: str) -> tuple[Surface, Tensor]:
+    """A surface, and the numbers that it is made of."""
+    rng = torch.Generator().manual_seed(4)
+    if kind == "terrain":
+        x = (torch.rand(40, 50, generator=rng, dtype=torch.float64) * 8).to(device).requires_grad_()
+        return HeightField(x), x
+    if kind == "cover":
+        x, *rest = (part.to(device) for part in torus(300))
+        return Slim(x.requires_grad_(), *rest), x
+    x = samples()[0, 0].to(device).requires_grad_()
+    return LevelSet(reconstruct(x, kind), 0.5), x
+
+
+@pytest.mark.parametrize("kind", ["triquadratic", "cubic-c1", "terrain", "cover"])
+def test_pictures_of_surfaces_and_their_derivatives(kind: str) -> None:
+    """With lights, shadows and what edges sweep over."""
+    results = []
+    for device in ("cpu", "cuda"):
+        surface, x = _surface_of(kind, device)
+        camera = PerspectiveCamera.framing(surface.domain, (0.37, 0.81, -0.46))
+        lights = (Light((1.0, -2.0, 1.5)), Light(None, (0.3, 0.4, 0.5)))
+        options = {"size": (24, 20), "dtype": torch.float64, "device": device, "lights": lights, "shadows": True}
+        image = raycast(surface, camera, Phong((0.8, 0.6, 0.4)), silhouettes=Silhouettes(2), **options)
+        assert isinstance(image, Tensor)
+        weights = torch.linspace(-0.3, 0.7, image.numel(), dtype=image.dtype, device=device).reshape(image.shape)
+        (found,) = torch.autograd.grad((image * weights).sum(), x)
+        results.append({"image": image, "numbers": found})
+    _assert_all_same(*results, 1e-7)
+    assert float(results[0]["image"].detach()[..., 3].mean()) > 0.1
