@@ -29,7 +29,11 @@ _BY_A_WORKER = "PYTEST_XDIST_WORKER" in os.environ
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compiled programs go to a folder of this run, which its workers and the processes of its tests share."""
+    """Compiled programs go to a folder of this run, which its workers and the processes of its tests share.
+
+    Python does not search for cycles among what is imported and collected, which is there to stay.
+    """
+    gc.disable()
     if not _BY_A_WORKER:
         os.environ["FILTERLAB_CACHE"] = tempfile.mkdtemp(prefix="filterlab-tests-")
 
@@ -37,6 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_finish() -> None:
     """Half a million objects are there to stay, and what tests import too: to walk them all takes 0.2 to 0.4 s."""
     gc.freeze()
+    gc.enable()
     young, middle, _ = gc.get_threshold()
     gc.set_threshold(young, middle, 50)
 

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
+from filterlab.cli.imports import importing
 from filterlab.cli.outcome import FAILED, INTERRUPTED, OK, USAGE, UsageError, message_of, out_of_memory, shortage
 from filterlab.cli.terminal import tell
 from filterlab.names import unknown_name
@@ -49,7 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _show_help()
         return OK
     try:
-        kind = kind_of(_command(arguments[0]))
+        with importing():
+            kind = kind_of(_command(arguments[0]))
         arguments, overrides = _split(kind, arguments)
         with _warnings_told():
             return _parse(kind, arguments).run(overrides) or OK

@@ -9,6 +9,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from filterlab.cli.imports import importing
 from filterlab.cli.loading import reading
 from filterlab.cli.options import Maybe, Quiet, check_asked, check_name
 from filterlab.cli.saving import OutputFile
@@ -55,10 +56,11 @@ class Mesh:
         if not 0 < self.step < math.inf:  # a NaN fails too
             raise ValueError(f"expected --step to be a positive number of voxels; got {self.step:g}")
 
-        from filterlab.scenes.build import PreparedSurface, build
-        from filterlab.scenes.plan import plan_of_mesh
-        from filterlab.scenes.plan_report import table
-        from filterlab.surfaces.meshes import mesh
+        with importing():
+            from filterlab.scenes.build import PreparedSurface, build
+            from filterlab.scenes.plan import plan_of_mesh
+            from filterlab.scenes.plan_report import table
+            from filterlab.surfaces.meshes import mesh
 
         scene, _ = scene_asked_for(self.scene, overrides, self.output, of_surface=True)
         with progress_bar(self.quiet) as progress, reading(progress):

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from filterlab import names
+from filterlab.cli.imports import importing
 from filterlab.cli.loading import load
 from filterlab.cli.options import MEMORY, TIME, Channel, Frame, Maybe, Quiet, check_name, quantity
 from filterlab.cli.outcome import NOTHING_FITS, OK
@@ -72,10 +73,11 @@ class Recommend:
         ):
             check_name(what, name, known)
 
-        from filterlab.io.volumes import describe
-        from filterlab.methods import reconstruct
-        from filterlab.recommendation import recommend, report
-        from filterlab.scenes.default import suggested
+        with importing():
+            from filterlab.io.volumes import describe
+            from filterlab.methods import reconstruct
+            from filterlab.recommendation import recommend, report
+            from filterlab.scenes.default import suggested
 
         part = {"frame": self.frame, "channel": self.channel}
         if self.output is not None and len(shape := describe(self.volume, **part).shape) != 3:

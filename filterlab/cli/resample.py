@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from filterlab import names
+from filterlab.cli.imports import importing
 from filterlab.cli.loading import load
 from filterlab.cli.memory import as_float, check_memory, limit_in_bytes
 from filterlab.cli.options import Channel, Frame, Maybe, Output, Quiet, Triple, check_name, result_type
@@ -117,10 +118,11 @@ class Resample:
         keeps = self.labels or self.method == "nearest"
         stored = None if self.dtype is None and not keeps else result_type(self.dtype or "input", source)
 
-        import torch
+        with importing():
+            import torch
 
-        from filterlab.resampling import check_fill, resample
-        from filterlab.volume import Volume
+            from filterlab.resampling import check_fill, resample
+            from filterlab.volume import Volume
 
         working = _working_type(stored, source)
         check_saveable(self.output, batched=len(source.shape) == 5, nifti2=self.nifti2)

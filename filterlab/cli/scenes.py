@@ -8,6 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from filterlab.cli.imports import importing
 from filterlab.cli.options import check_device, check_not_input
 from filterlab.cli.outcome import UsageError
 
@@ -26,8 +27,9 @@ def scene_asked_for(
 
     Raises ValueError for one without a surface where it has to be `of_surface`, of a volume before that is read.
     """
-    from filterlab.scenes.build import alone_scene, load_scene, surface_scene, terrain_scene, values_scene
-    from filterlab.scenes.default import default_view
+    with importing():
+        from filterlab.scenes.build import alone_scene, load_scene, surface_scene, terrain_scene, values_scene
+        from filterlab.scenes.default import default_view
 
     part = {name: overrides.pop(name) for name in ("frame", "channel") if name in overrides}
     level = overrides.pop("level", None)

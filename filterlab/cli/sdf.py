@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from filterlab.cli.imports import importing
 from filterlab.cli.memory import check_memory, limit_in_bytes
 from filterlab.cli.options import Maybe, Output, Quiet, Triple, check_name
 from filterlab.cli.outcome import UsageError
@@ -61,11 +62,12 @@ class Sdf:
         check_name("dtype", self.dtype, ("float32", "float64"))
         output = OutputFile.at(self.output, self.input, quiet=self.quiet)
 
-        import torch
+        with importing():
+            import torch
 
-        from filterlab.io.meshes import load_mesh
-        from filterlab.io.volumes import check_saveable
-        from filterlab.signed_distances import libigl, signed_distance
+            from filterlab.io.meshes import load_mesh
+            from filterlab.io.volumes import check_saveable
+            from filterlab.signed_distances import libigl, signed_distance
 
         check_saveable(self.output, nifti2=self.nifti2)
         libigl()

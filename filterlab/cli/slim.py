@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from filterlab.cli.imports import importing
 from filterlab.cli.options import Output, Quiet, check_name
 from filterlab.cli.saving import OutputFile
 from filterlab.cli.terminal import progress_bar, tell
@@ -54,9 +55,10 @@ class Slim:
         check_slim_file(self.output)
         output = OutputFile.at(self.output, self.input, quiet=self.quiet)
 
-        from filterlab.io.points import load_points
-        from filterlab.surfaces import fit_slim
-        from filterlab.surfaces.fitting import check_settings
+        with importing():
+            from filterlab.io.points import load_points
+            from filterlab.surfaces import fit_slim
+            from filterlab.surfaces.fitting import check_settings
 
         check_settings(self.tolerance, self.least)
         points, normals = load_points(self.input)

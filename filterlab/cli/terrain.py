@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from filterlab.cli.imports import importing
 from filterlab.cli.options import Maybe, Quiet, check_asked, check_name
 from filterlab.cli.outcome import UsageError
 from filterlab.cli.pictures import Filmed
@@ -138,8 +139,9 @@ class Terrain:
 
         from pydantic_core import to_jsonable_python
 
-        from filterlab.io.config import ConfigError
-        from filterlab.scenes.build import terrain_scene
+        with importing():
+            from filterlab.io.config import ConfigError
+            from filterlab.scenes.build import terrain_scene
 
         keys = {name: _KEYS.get(name, f"terrain.{name}") for name in _OPTIONS}
         given = {name: getattr(self, name) for name in _OPTIONS}
