@@ -200,12 +200,13 @@ def test_scattered_points_are_asked_for_and_sorted_without_a_bit_of_difference(m
 
 
 def test_which_points_are_sorted():
-    """Many of a large grid; whether they lie all over it is asked before."""
+    """Many of a large grid, where patches are no planes; whether they lie all over it is asked before."""
     values, many = torch.zeros(1, 800, 800), 1 << 16
     points, heights = places(1, many, 800.0).float(), given(SPLINES["c1"], values)
-    assert cpu_heights._sorting_pays(values, points)
-    assert not cpu_heights._sorting_pays(values[:, :600], points)
-    assert not cpu_heights._sorting_pays(values, points[:, 1:])
+    assert cpu_heights._sorting_pays(heights, values, points)
+    assert not cpu_heights._sorting_pays(given(SPLINES["linear"], values), values, points)
+    assert not cpu_heights._sorting_pays(heights, values[:, :600], points)
+    assert not cpu_heights._sorting_pays(heights, values, points[:, 1:])
     assert cpu_heights._scattered(heights, values, points)
     assert not cpu_heights._scattered(heights, values, points.sort(1).values)
 

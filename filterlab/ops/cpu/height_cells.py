@@ -72,7 +72,7 @@ class Windows:
                 self.base.value, self.stride.value = self.buffer, I64(self.length)
 
     def ask(self, x: Value, y: Value) -> None:
-        """Have the window of the cell (x, y) brought near, as far as it is in the grid: no address of others is read."""
+        """Have the window of the cell (x, y) brought near; of one that is partly outside, whatever lies there."""
         e, b, j, cell = self.lanes, self.builder, self.job, self.cell
         left, top = (b.sub(b.mul(n, I64(cell.steps)), I64(cell.before)) for n in (x, y))
         row = e.advance(j.values, b.add(b.mul(top, j.row), left), self.storage.raw)

@@ -20,7 +20,8 @@ from filterlab.ops.cpu.height_data import Data
 from filterlab.ops.cpu.lanes import DOUBLE, I32, I64, STORAGE, Lanes, Value
 from filterlab.ops.heights import Masks, Pattern, rows
 
-BLOCK = 2  # packs that are located before the first of them is summed
+_LINES_ASKED = 512  # of memory, at most, before the first of them is read
+_FEWEST_PACKS = 2  # that are located before the first of them is summed
 _BEYOND = 2.0**31 - 256  # columns or rows, of points: further than any grid has
 
 # Strides are in numbers.
@@ -95,6 +96,12 @@ class _Located:
     signs: list[Value]
 
 
+def _packs_at_once(variant: HeightsVariant) -> int:
+    """How many packs are located before the first of them is summed: many where points are never sorted."""
+    rows_of_data = len({b for _, b in variant.pattern.offsets})
+    return _LINES_ASKED // (rows_of_data * variant.lanes) if variant.pattern.degree == 1 else _FEWEST_PACKS
+
+
 class _Program:
     def __init__(self, variant: HeightsVariant, function: ir.Function) -> None:
         self.variant = variant
@@ -103,10 +110,10 @@ class _Program:
         self.wide = Lanes(self.builder, "float64", variant.lanes)
         self.storage, self.rows = STORAGE[variant.storage], rows(variant.order)
         self.job = frame.load_job(self.lanes, function.args[0], FIELDS)
-        self.masks = Masks(self.lanes, variant.pattern)
-        self.data = Data(self.lanes, self.job, variant.pattern, self.storage, variant.zeros, BLOCK)
-        self.local = self.lanes.reserve(self.lanes.number, 2 * BLOCK * variant.lanes)
-        self.down = self.lanes.reserve(I32, BLOCK * variant.lanes)
+        self.masks, self.packs = Masks(self.lanes, variant.pattern), _packs_at_once(variant)
+        self.data = Data(self.lanes, self.job, variant.pattern, self.storage, variant.zeros, self.packs)
+        self.local = self.lanes.reserve(self.lanes.number, 2 * self.packs * variant.lanes)
+        self.down = self.lanes.reserve(I32, self.packs * variant.lanes)
         per_step = (self.wide.divide(DOUBLE(1), getattr(self.job, f"step_{axis}")) for axis in "xy")
         self.per_step = [self.lanes.convert(self.wide.everywhere(own), STORAGE["float64"]) for own in per_step]
 
@@ -120,8 +127,8 @@ class _Program:
             own_rows = e.advance(j.rows, e.product(entry, I64(len(self.rows)), j.count), e.number)
             values = e.advance(j.values, b.mul(entry, j.values_entry), self.storage.raw)
             last = e.smaller(b.add(first, j.chunk), packs)
-            with e.repeat(first, last, BLOCK) as block:
-                end = e.smaller(b.add(block, I64(BLOCK)), last)
+            with e.repeat(first, last, self.packs) as block:
+                end = e.smaller(b.add(block, I64(self.packs)), last)
                 with e.repeat(block, end) as pack:
                     self._find(b.mul(pack, I64(e.count)), b.sub(pack, block), points, values)
                 with e.repeat(block, end) as pack:

@@ -4,8 +4,8 @@ Same meaning as `ops.reference.heights`. Heights are read as they are stored, su
 of jet does not depend on the number of threads, bit by bit; that of splat only on their number. Memory beyond the
 results: 8 bytes for every row and column of the heights; of splat a copy of the result for every further thread.
 
-Points that lie all over a large grid wait for memory. Their data are asked for a pack ahead; many points are sorted by
-tiles first (`ops.cpu.order`), in copies of a part of them.
+Points that lie all over a large grid wait for memory. Their data are asked for ahead; where a patch has more than 3,
+many points are sorted by tiles first (`ops.cpu.order`), in copies of a part of them.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def jet(heights: Heights, points: Tensor, order: int) -> Tensor:
         return out
     values, points = _in_lines(heights.values), readable(points, 1)
     asked = _scattered(heights, values, points)
-    if not (asked and _sorting_pays(values, points)):
+    if not (asked and _sorting_pays(heights, values, points)):
         _jet(heights, values, points, out, order, asked)
         return out
     for entry, part, ordered in in_order(points, _tiles(heights)):
@@ -74,7 +74,7 @@ def splat(heights: Heights, points: Tensor, cotangents: Tensor, order: int) -> T
     every = [out, *(zeros(shape, out.dtype) for _ in range(parts - 1))]
     points, cotangents = readable(points, 1), readable(cotangents.to(points.dtype), 0)
     asked = _scattered(heights, out, points)
-    if not (asked and _sorting_pays(out, points)):
+    if not (asked and _sorting_pays(heights, out, points)):
         _splat(heights, every, points, cotangents, order, asked)
     else:
         for entry, part, ordered in in_order(points, _tiles(heights)):
@@ -147,9 +147,10 @@ def _scattered(heights: Heights, values: Tensor, points: Tensor) -> bool:
     return scattered(points, _NEAR * points.new_tensor(heights.spacing).abs())
 
 
-def _sorting_pays(values: Tensor, points: Tensor) -> bool:
-    """Whether sorting scattered points costs less than it saves."""
-    return points.shape[1] >= FEWEST_SORTED and _bytes_of(values) >= _SMALLEST_SORTED_IN
+def _sorting_pays(heights: Heights, values: Tensor, points: Tensor) -> bool:
+    """Whether sorting scattered points costs less than it saves: not for planes, whose data are asked for in time."""
+    enough = points.shape[1] >= FEWEST_SORTED and _bytes_of(values) >= _SMALLEST_SORTED_IN
+    return enough and heights.pattern.degree > 1
 
 
 def _bytes_of(values: Tensor) -> int:

@@ -39,7 +39,7 @@ from filterlab.ops.cpu.sorting import AXES, SortingJob, SortingVariant
 POINTS_AT_ONCE = 1 << 22  # points that are sorted together, for which copies of points and rows are held
 _EDGE = 8  # of a brick
 _MOST_BRICKS = 1 << 16
-_LOOKED_AT = 2048
+_LOOKED_AT = 512
 
 
 def scattered(points: Tensor, edge: Tensor | float = _EDGE) -> bool:
