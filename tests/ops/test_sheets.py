@@ -96,6 +96,11 @@ def along_z(values: list[float], method: str = "trilinear", **how) -> GridField:
     return fl.reconstruct(torch.tensor(values, dtype=torch.float64)[:, None, None].expand(-1, 6, 6), method, **how)
 
 
+def parabola() -> list[float]:
+    """(z − 6.3)² at 0 … 12."""
+    return ((torch.arange(13.0, dtype=torch.float64) - 6.3) ** 2).tolist()
+
+
 def up_and_down(field: GridField, level: float) -> tuple[Raycast, Tensor, Tensor]:
     o = torch.tensor([[2.3, 1.7, -3.0], [2.3, 1.7, 19.0], [2.3, 1.7, 2.0]], dtype=torch.float64)
     d = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, 0, 1]], dtype=torch.float64)
@@ -130,14 +135,22 @@ def test_stretches_on_the_level_and_corners_at_it(values, expected):
 @pytest.mark.parametrize("method", ["triquadratic", "tricubic"])
 def test_two_roots_that_are_nearly_one(method, depth):
     """(z − 6.3)² = depth: two hits, one where rounding hides which, or none, and all of them twice from both sides."""
-    z = torch.arange(13.0, dtype=torch.float64) - 6.3
-    field = along_z((z**2).tolist(), method, boundary="border")
-    given, o, d = up_and_down(field, depth)
+    given, o, d = up_and_down(along_z(parabola(), method, boundary="border"), depth)
     every, _ = of_twin(given, o, d)
     found = raycast.sheets(given, o, d, asked(50), "cpu")
     assert torch.equal(found < torch.inf, every < torch.inf)
     assert_near(found, every, 1e-6)
     assert_near(raycast.sheets(given, o, d, asked(1), "cpu"), raycast.first(given, o, d, "cpu")[:, None], 0.0)
+
+
+def test_hits_that_rounding_alone_has_apart_are_one():
+    """It is taken for so large here that those 0.6 apart are one, those 1.4 apart are not."""
+    given, o, d = up_and_down(along_z([0.0, 1.0] * 4), 0.3)
+    how = Sheets(30, False, 0.7 / (32 * 2.0**-52))
+    found = raycast.sheets(given, o, d, how, "cpu")
+    assert_near(found, raycast.sheets(given, o, d, how, "reference"))
+    assert int((found[0] < torch.inf).sum()) == 4
+    assert float(found[0, 0]) == pytest.approx(2.7, abs=1e-12)
 
 
 def test_many_sheets_of_a_ray():

@@ -100,7 +100,7 @@ class FirstRoot:
             found: is given a mask of those whose part was found, its coefficients, a and h; the others have none.
         """
         e, b = self.lanes, self.builder
-        one, two, half = e.constant(1), e.constant(2), e.constant(0.5)
+        one = e.constant(1)
         own, lowered = [e.kept(r) for r in rows], [e.kept(r) for r in self.lowered(rows)]
         left = e.variable(mask)
         a, h = e.variable(e.constant(0)), e.variable(one)
@@ -116,13 +116,18 @@ class FirstRoot:
                 found(holds, self.between([r.all(e.count) for r in own], a.value, end), a.value, h.value)
             halves = b.and_(left.value, b.and_(several, b.not_(narrow)))
             on = b.and_(b.and_(left.value, b.not_(holds)), b.not_(halves))
-            a.value = e.where(on, end, a.value)
-            doubled = e.multiply(h.value, two)
-            parts = e.divide(a.value, doubled)
-            wider = b.and_(on, b.fcmp_ordered("==", e.floor(parts), parts))
-            h.value = e.where(halves, e.multiply(h.value, half), e.where(wider, doubled, h.value))
+            a.value, h.value = self.moved(a.value, h.value, on, halves)
             over = b.and_(on, b.fcmp_ordered(">=", a.value, one))
             left.value = b.and_(left.value, b.not_(b.or_(holds, over)))
+
+    def moved(self, a: Value, h: Value, on: Value, halves: Value) -> tuple[Value, Value]:
+        """a and h of the next part, as wide as its place allows; or of the first half of this one."""
+        e, b = self.lanes, self.builder
+        a = e.where(on, e.add(a, h), a)
+        doubled = e.multiply(h, e.constant(2))
+        parts = e.divide(a, doubled)
+        wider = b.and_(on, b.fcmp_ordered("==", e.floor(parts), parts))
+        return a, e.where(halves, e.multiply(h, e.constant(0.5)), e.where(wider, doubled, h))
 
     def between(self, rows: Rows, start: Value, end: Value) -> Rows:
         """Coefficients on [start, end], by de Casteljau's algorithm at the end and, from there, at start / end."""
@@ -300,7 +305,7 @@ class NextRoots(FirstRoot):
         counted = b.or_(counted, holds)
         self._until.value = until = e.where(holds, end, self._until.value)
         on = b.and_(left, b.or_(narrow, b.not_(b.or_(*many))))
-        self._move(left, on)
+        self._a.value, self._h.value = self.moved(a, h, on, b.and_(left, b.not_(on)))
         there = e.where(not_above[-1], e.where(not_below[-1], zero, e.constant(-1)), one)
         left_behind = b.and_(counted, b.or_(leaves, several))
         late = b.and_(counted, b.fcmp_ordered(">=", end, until))  # left within rounding
@@ -311,14 +316,3 @@ class NextRoots(FirstRoot):
 
     def _on(self, kept: Sequence[Kept], a: Value, end: Value) -> Rows:
         return self.between([pack.all(self.lanes.count) for pack in kept], a, end)
-
-    def _move(self, left: Value, on: Value) -> None:
-        """To the next part, as wide as its place allows, or to the first half of this one."""
-        e, b, a, h = self.lanes, self.builder, self._a.value, self._h.value
-        a = e.where(on, e.add(a, h), a)
-        doubled = e.multiply(h, e.constant(2))
-        parts = e.divide(a, doubled)
-        wider = b.and_(on, b.fcmp_ordered("==", e.floor(parts), parts))
-        halves = b.and_(left, b.not_(on))
-        self._a.value = a
-        self._h.value = e.where(halves, e.multiply(h, e.constant(0.5)), e.where(wider, doubled, h))

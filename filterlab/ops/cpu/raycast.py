@@ -21,7 +21,6 @@ from filterlab.ops.cpu.memory import ARITHMETIC, has_room
 from filterlab.ops.gather import STORAGE, in_whole_rows
 from filterlab.ops.raycast import RADII, Candidates, Raycast, Sheets, Written, written_in_parts
 
-_ALL = 1 << 62  # more sheets than any ray has
 _WASTED = 17 / 16  # places for rays in packs of two rows, over rays: more would take back most of what is gained
 
 
@@ -35,16 +34,12 @@ def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
 
 def sheets(given: Raycast, origins: Tensor, directions: Tensor, asked: Sheets) -> Tensor:
     """`ops.reference.raycast.sheets`, fused: t (..., k) float64 of rays (..., 3), without derivatives."""
-    shape = origins.shape[:-1]
-    t = torch.full((*shape, asked.count), torch.inf, dtype=torch.float64)
-    if not t.numel():
-        return t
-    count = torch.empty((*shape, 1), dtype=torch.int64)
-    cast = _Cast(given, "sheets", origins, directions)
-    cast.job.sheets, cast.job.extent = asked.count, asked.extent
-    cast.job.most = _ALL if asked.farthest else asked.count
-    cast.run(t=t, count=count)
-    return t.gather(-1, (count - 1 - torch.arange(asked.count)) % asked.count) if asked.farthest else t
+    t, count = asked.room(origins.shape[:-1], origins.device)
+    if t.numel():
+        cast = _Cast(given, "sheets", origins, directions)
+        cast.job.sheets, cast.job.most, cast.job.extent = asked.count, asked.most, asked.extent
+        cast.run(t=t, count=count)
+    return asked.in_order(t, count)
 
 
 def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidates:
