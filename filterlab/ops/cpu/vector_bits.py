@@ -49,8 +49,8 @@ class VectorVariant:
 
 
 def _write(function: ir.Function, variant: VectorVariant) -> None:
-    b = ir.IRBuilder(function.append_basic_block("entry"))
-    e = Lanes(b, variant.arithmetic, variant.lanes)
+    e = Lanes(ir.IRBuilder(function.append_basic_block("entry")), variant.arithmetic, variant.lanes)
+    b = e.builder
     j = frame.load_job(e, function.args[0], FIELDS)
     unsigned = e.integers((1 << (e.bits - 1)) - 1)
     most, least = e.variable(e.integers(0)), e.variable(unsigned)
