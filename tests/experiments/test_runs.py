@@ -13,8 +13,9 @@ import torch
 from experiments import registry
 from experiments.__main__ import main
 from experiments.config import ExperimentConfig
+from experiments.errors import RunError
 from experiments.report.page import Section, picture
-from experiments.runs import Run, RunError, Unit, _commit, config_hash, read_provenance, read_records, run_folder
+from experiments.runs import Run, Unit, _commit, config_hash, read_provenance, read_records, run_folder
 
 START = {"started": "2026-01-01T00:00:00+00:00"}
 
@@ -56,9 +57,8 @@ def count_slowly(journal, seconds):
     def units(config):
         return [Unit(str(i), str(i)) for i in range(config.count)]
 
-    registry.EXPERIMENTS["counting"] = registry.Experiment(
-        "counting", Config, units, compute, lambda *_: Section("counting")
-    )
+    counting = registry.Experiment("counting", Config, units, compute, lambda *_: Section("counting"))
+    registry.EXPERIMENTS = {"counting": counting}
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def slow(tmp_path, forks, command, monkeypatch, capsys):
     path.write_text("experiment: counting\ndescription: counts slowly\ncount: 30\n")
     journal = tmp_path / "journal"
     arguments = ["run", path, "--runs", tmp_path / "runs"]
-    monkeypatch.setattr(registry, "EXPERIMENTS", dict(registry.EXPERIMENTS))
+    monkeypatch.setattr(registry, "EXPERIMENTS", registry.EXPERIMENTS)  # as it was, afterwards
 
     def start(code=SLOW):
         return command(journal, *arguments, code=code)
