@@ -376,6 +376,10 @@ class GridField(Field):
     def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
         return casting.first(self._raycast(level, origins, directions), origins, directions, self._caster)
 
+    def crossings(self, origins: Tensor, directions: Tensor, level: float, count: int, farthest: bool) -> Tensor:
+        given = self._raycast(level, origins, directions)
+        return casting.sheets(given, origins, directions, self._sheets(count, farthest), self._caster)
+
     def crossing_candidates(self, origins: Tensor, directions: Tensor, level: float) -> Candidates:
         return casting.candidates(self._raycast(level, origins, directions), origins, directions, self._caster)
 

@@ -1,7 +1,8 @@
 """Casting rays as vector code: describes lattices and rays to the programs of `ops.cpu.crossings`.
 
-Memory beyond the result: two bytes for every brick; for candidates 24 + 1 bytes and n + 1 numbers for every ray and
-each of the `capacity` that there is room for.
+Memory beyond the result: two bytes for every brick; for sheets 8 bytes for every ray, and as much as the result once or
+twice more for the farthest; for candidates 24 + 1 bytes and n + 1 numbers for every ray and each of the `capacity` that
+there is room for.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.cpu.memory import ARITHMETIC, has_room
 from filterlab.ops.gather import STORAGE, in_whole_rows
-from filterlab.ops.raycast import RADII, Candidates, Raycast, Written, written_in_parts
+from filterlab.ops.raycast import RADII, Candidates, Raycast, Sheets, Written, written_in_parts
 
+_ALL = 1 << 62  # more sheets than any ray has
 _WASTED = 17 / 16  # places for rays in packs of two rows, over rays: more would take back most of what is gained
 
 
@@ -29,6 +31,20 @@ def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
     if t.numel():
         _Cast(given, "first", origins, directions).run(t=t)
     return t
+
+
+def sheets(given: Raycast, origins: Tensor, directions: Tensor, asked: Sheets) -> Tensor:
+    """`ops.reference.raycast.sheets`, fused: t (..., k) float64 of rays (..., 3), without derivatives."""
+    shape = origins.shape[:-1]
+    t = torch.full((*shape, asked.count), torch.inf, dtype=torch.float64)
+    if not t.numel():
+        return t
+    count = torch.empty((*shape, 1), dtype=torch.int64)
+    cast = _Cast(given, "sheets", origins, directions)
+    cast.job.sheets, cast.job.extent = asked.count, asked.extent
+    cast.job.most = _ALL if asked.farthest else asked.count
+    cast.run(t=t, count=count)
+    return t.gather(-1, (count - 1 - torch.arange(asked.count)) % asked.count) if asked.farthest else t
 
 
 def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidates:

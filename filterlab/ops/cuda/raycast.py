@@ -17,7 +17,8 @@ from filterlab.ops.cuda.crossings import ARRAYS, NUMBERS, SIZES, RaycastVariant
 from filterlab.ops.cuda.launch import interpreting, launchable
 from filterlab.ops.cuda.taps import AXES
 from filterlab.ops.gather import in_whole_rows
-from filterlab.ops.raycast import Candidates, Raycast, Written, written_in_parts
+from filterlab.ops.raycast import Candidates, Raycast, Sheets, Written, written_in_parts
+from filterlab.ops.reference.raycast import sheets_by
 
 
 def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
@@ -25,6 +26,11 @@ def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
     t = torch.empty(origins.shape[:-1], dtype=torch.float64, device=origins.device)
     _cast(given, "first", origins.reshape(-1, 3), directions.reshape(-1, 3), {"t": t})
     return t
+
+
+def sheets(given: Raycast, origins: Tensor, directions: Tensor, asked: Sheets) -> Tensor:
+    """`ops.reference.raycast.sheets`: pieces by a program, their roots in plain torch."""
+    return sheets_by(lambda o, d: candidates(given, o, d), origins, directions, asked)
 
 
 def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidates:

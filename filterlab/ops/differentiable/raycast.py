@@ -9,7 +9,7 @@ from filterlab.ops import cpu, cuda
 from filterlab.ops import raycast as description
 from filterlab.ops.differentiable.drivers import driver, room_of
 from filterlab.ops.differentiable.recording import transforming
-from filterlab.ops.raycast import Candidates, Raycast
+from filterlab.ops.raycast import Candidates, Raycast, Sheets
 from filterlab.ops.tetrahedra import AnyLattice
 
 _FEWEST = 1 << 13
@@ -42,6 +42,13 @@ def first(given: Raycast, origins: Tensor, directions: Tensor, implementation: s
         implementation: "reference", "cpu" or "cuda"; None: the fastest that can run.
     """
     return _driver(given, origins, implementation).first(given, origins, directions)
+
+
+def sheets(
+    given: Raycast, origins: Tensor, directions: Tensor, asked: Sheets, implementation: str | None = None
+) -> Tensor:
+    """t (..., k) float64, where rays (..., 3) meet the level; ∞ where they no longer do. Arguments as for `first`."""
+    return _driver(given, origins, implementation).sheets(given, origins, directions, asked)
 
 
 def candidates(given: Raycast, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Candidates:
