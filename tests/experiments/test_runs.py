@@ -229,7 +229,7 @@ def test_other_code_is_known_by_the_records_it_made(tmp_path, changed):
     assert start(None) == [5]
 
 
-def test_a_run_goes_on_with_other_code_only_with_a_warning(tiny_rms, tmp_path, monkeypatch, capsys):
+def test_a_run_goes_on_with_other_code_only_with_a_warning(undrawn, tiny_rms, tmp_path, monkeypatch, capsys):
     arguments = ["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]
     monkeypatch.setattr("experiments.runs._commit", lambda: "aaaa")
     assert main(arguments) == 0
@@ -285,7 +285,7 @@ def test_two_processes_do_not_share_a_folder(tmp_path):
         pass
 
 
-def test_what_makes_a_run_repeatable_is_written_down(tiny_rms, tmp_path):
+def test_what_makes_a_run_repeatable_is_written_down(undrawn, tiny_rms, tmp_path):
     assert main(["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]) == 0
     (folder,) = (tmp_path / "runs").iterdir()
     (start,) = read_provenance(folder)
@@ -297,7 +297,7 @@ def test_what_makes_a_run_repeatable_is_written_down(tiny_rms, tmp_path):
     assert "boundary: reflect" in (folder / "config.yaml").read_text()  # a default, written out
 
 
-def test_a_finished_run_is_not_computed_again(tiny_rms, tmp_path, monkeypatch, capsys):
+def test_a_finished_run_is_not_computed_again(undrawn, tiny_rms, tmp_path, monkeypatch, capsys):
     arguments = ["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]
     assert main(arguments) == 0
     (folder,) = (tmp_path / "runs").iterdir()
