@@ -7,7 +7,7 @@ from torch import Tensor
 
 from filterlab.ops import cpu, cuda
 from filterlab.ops import raycast as description
-from filterlab.ops.differentiable.drivers import driver
+from filterlab.ops.differentiable.drivers import driver, room_of
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.raycast import Candidates, Raycast, Sheets
 from filterlab.ops.tetrahedra import AnyLattice
@@ -76,4 +76,4 @@ def _driver(given: Raycast, origins: Tensor, implementation: str | None):
 
 def _implementation_for(lattice: AnyLattice) -> str:
     """What casts rays at these coefficients: "cpu" (vector code), or "cuda" (Triton) on a GPU."""
-    return "cuda" if lattice.coefficients.device.type == "cuda" else "cpu"
+    return room_of(lattice.coefficients.device)
