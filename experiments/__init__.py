@@ -2,7 +2,9 @@
 
     python -m experiments list | run CONFIG [--field value …] | report RUN
 
-config.py     what every config shares; a config file is found, read and checked here
+headings.py   a config file is found, and which experiment it is for
+config.py     what every config shares, and what is checked before anything is computed
 runs.py       a run folder: resolved config, provenance, records; resumes where it stopped
-registry.py   EXPERIMENTS: name -> config model, units of work, computation, report section
+running.py    units of work one after the other, with what is told meanwhile
+registry.py   EXPERIMENTS: name -> config model, units of work, computation, report section; imported when asked for
 """

@@ -1,4 +1,4 @@
-"""Typed, validated experiment configs: what they share, and how a config file is found and read."""
+"""Typed, validated experiment configs: what they share."""
 
 from __future__ import annotations
 
@@ -11,17 +11,14 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, Field, model_validator
 
 import filterlab as fl
 from filterlab import signals
 from filterlab.fields.base import Domain
-from filterlab.io.config import ConfigError, Problem, StrictModel, load_config
+from filterlab.io.config import ConfigError, Problem, StrictModel
 from filterlab.io.volumes import files_of
 from filterlab.scenes.model import Reconstruction, SignalModel, VolumeFile
-
-CONFIGS = Path(__file__).resolve().parent.parent / "configs"
-
 
 Dtype = Literal["float32", "float64"]
 BoundaryName = Literal["mirror", "reflect", "wrap", "border", "zeros"]
@@ -189,51 +186,6 @@ def increasing(numbers: Iterable[int]) -> list[int]:
     if any(b <= a for a, b in pairwise(listed)):
         raise ValueError(f"expected increasing numbers; got {listed}")
     return listed
-
-
-def known_configs(folder: Path = CONFIGS) -> dict[str, Path]:
-    """The config files of the project, by name.
-
-    Raises:
-        ConfigError: there are none, as in a copy of this package without its configs.
-    """
-    found = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-    if not found:
-        message = (
-            "expected the config files of the project, *.yaml; found none (they come with a checkout of filterlab)"
-        )
-        raise ConfigError([Problem(str(folder), "", message)])
-    return found
-
-
-def config_path(name: str) -> Path:
-    """The config file that `name` stands for: a path, or the bare name of a file in configs/.
-
-    Raises:
-        ConfigError: neither; the message lists the known names.
-    """
-    path = Path(name)
-    if path.is_file():
-        return path
-    configs = known_configs()
-    if name.removesuffix(".yaml") in configs:
-        return configs[name.removesuffix(".yaml")]
-    message = f"expected the path of a YAML file or one of the known configs: {', '.join(configs)}"
-    raise ConfigError([Problem(name, "", f"{message}; found neither")])
-
-
-class Heading(BaseModel):
-    """The two keys that every config file begins with; the rest depends on the experiment."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    experiment: str
-    description: Annotated[str, Field(min_length=1)]
-
-
-def load_heading(path: Path) -> Heading:
-    """Which experiment a config file is for, and its one-line description."""
-    return load_config(path, Heading, None)
 
 
 def check_device(name: str, path: str = "device") -> None:

@@ -19,7 +19,8 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from experiments.runs import Record, Run, RunError
+from experiments.errors import RunError
+from experiments.runs import Record, Run
 from filterlab.io.atomic import atomic_write
 from filterlab.io.config import StrictModel
 from filterlab.scenes.model import Positive

@@ -1,4 +1,4 @@
-"""EXPERIMENTS: what the command, the tests and the demo know.
+"""EXPERIMENTS: what the command, the tests and the demo know, each imported when it is asked for.
 
 An experiment is a module here with `Config`, `units`, `compute` (and `check`), and a module of the same name in
 `experiments.report` with `draw`. To add one: write both, add its name to `_NAMES`, add a config to configs/.
@@ -6,17 +6,20 @@ An experiment is a module here with `Config`, `units`, `compute` (and `check`), 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from experiments.config import Heading, check_device, config_path, load_heading
-from experiments.report.page import Section
-from experiments.runs import Record, Run, Unit
+from experiments.headings import Heading, config_path, load_heading
 from filterlab.io.config import ConfigError, Problem, load_config
 from filterlab.names import unknown_name
+
+if TYPE_CHECKING:
+    from experiments.report.page import Section
+    from experiments.runs import Record, Run, Unit
 
 _NAMES = (
     "frequency_response",
@@ -80,26 +83,58 @@ class Experiment:
     check: Callable[[Any, str], None] = _nothing_to_check
 
 
+@cache
 def _experiment(name: str) -> Experiment:
-    computing, drawing = (import_module(f"experiments.{part}{name}") for part in ("", "report."))
+    """Drawing is imported when something is drawn: matplotlib takes a second."""
+    computing = import_module(f"experiments.{name}")
+
+    def draw(config: Any, records: Mapping[str, Record], folder: Path) -> Section:
+        return import_module(f"experiments.report.{name}").draw(config, records, folder)
+
     check = getattr(computing, "check", _nothing_to_check)
-    return Experiment(name, computing.Config, computing.units, computing.compute, drawing.draw, check)
+    return Experiment(name, computing.Config, computing.units, computing.compute, draw, check)
 
 
-EXPERIMENTS: dict[str, Experiment] = {name: _experiment(name) for name in _NAMES}
+class _Experiments(Mapping[str, Experiment]):
+    """Those of `_NAMES`: all imported at once take longer than torch."""
+
+    def __getitem__(self, name: str) -> Experiment:
+        if name not in _NAMES:
+            raise KeyError(name)
+        return _experiment(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in _NAMES
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_NAMES)
+
+    def __len__(self) -> int:
+        return len(_NAMES)
 
 
-def experiment_of(path: Path) -> tuple[Experiment, Heading]:
-    """The experiment a config file is for. Raises ConfigError that lists the known experiments."""
+EXPERIMENTS: Mapping[str, Experiment] = _Experiments()
+
+
+def heading_of(path: Path) -> Heading:
+    """What a config file is for. Raises ConfigError that lists the known experiments."""
     heading = load_heading(path)
     if heading.experiment not in EXPERIMENTS:
         message = unknown_name("experiment", heading.experiment, EXPERIMENTS)
         raise ConfigError([Problem(str(path), "experiment", message)])
+    return heading
+
+
+def experiment_of(path: Path) -> tuple[Experiment, Heading]:
+    """The experiment a config file is for. Raises ConfigError that lists the known experiments."""
+    heading = heading_of(path)
     return EXPERIMENTS[heading.experiment], heading
 
 
 def load(name: str, overrides: Mapping[str, str] | None = None) -> tuple[str, Experiment, Any]:
     """Name, experiment and typed config of a config file, given by path or bare name, checked against this machine."""
+    from experiments.config import check_device  # it imports torch, which names and headings need not wait for
+
     path = config_path(name)
     experiment, _ = experiment_of(path)
     config = load_config(path, experiment.config, overrides)

@@ -30,6 +30,7 @@ import torch
 from pydantic import BaseModel
 from torch import Tensor
 
+from experiments.errors import RunError
 from filterlab.io import load_image, save_image
 from filterlab.io.atomic import atomic_write, remove_temporaries
 from filterlab.io.config import dump_config
@@ -40,10 +41,6 @@ T = TypeVar("T")
 CODE = ("filterlab", "commit")  # of a start: by which code its records were computed
 _APPENDING = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
 _WRITTEN_WITHIN = 60.0  # seconds: a report that another process is writing just now is not taken from it
-
-
-class RunError(ValueError):
-    """A run folder that can't be used, said so that the reader knows what to do."""
 
 
 @dataclass(frozen=True)

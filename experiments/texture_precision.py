@@ -32,8 +32,9 @@ from experiments.config import (
     number,
 )
 from experiments.dvr_signal import amplified_difference, image_errors
+from experiments.errors import RunError
 from experiments.rms_error import angles, evaluate, uniform_points
-from experiments.runs import Record, Run, RunError, Unit
+from experiments.runs import Record, Run, Unit
 from experiments.views import View
 from filterlab import metrics
 from filterlab.fields.base import Domain

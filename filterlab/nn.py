@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -83,6 +83,10 @@ class Reconstruction(torch.nn.Module):
         if self._kept is None or self._kept[0] is not key[0] or self._kept[1] != key[1]:
             self._kept = *key, self._made()
         return self._kept[2]
+
+    if TYPE_CHECKING:  # torch says that modules give anything
+
+        def __call__(self, points: Array) -> Tensor: ...
 
     def forward(self, points: Array) -> Tensor:
         """Values at world points; see `Field`."""

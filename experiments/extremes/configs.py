@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.config import known_configs, load_heading
 from experiments.extremes.contract import Case, Finding, Subject, Tally
 from experiments.extremes.mutations import edited, random_edits
+from experiments.headings import known_configs, load_heading
+from experiments.registry import EXPERIMENTS
 from filterlab.io.config import MAX_BYTES, ConfigError, StrictModel, loads_config
 from filterlab.scenes.model import Scene
 
@@ -96,8 +97,6 @@ def huge(subject: Subject, random: np.random.Generator, amount: float) -> Findin
 
 def damaged(subject: Subject, random: np.random.Generator, amount: float) -> Finding:
     """Configs and scenes of this project with some bytes changed: a config, or a ConfigError with a place."""
-    from experiments.registry import EXPERIMENTS  # it knows `stability`, which knows this
-
     tally = Tally()
     known = [
         (path.read_bytes(), EXPERIMENTS[load_heading(path).experiment].config) for path in known_configs().values()

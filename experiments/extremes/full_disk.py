@@ -19,8 +19,8 @@ from tempfile import TemporaryDirectory
 
 import torch
 
+from experiments.errors import RunError
 from experiments.extremes.killing import Work, checked, works
-from experiments.runs import RunError
 from filterlab.io.atomic import disk_is_full
 
 PAGE = 4096

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 
 from experiments.config import ExperimentConfig
+from experiments.errors import RunError
 from experiments.extremes import full_disk
 from experiments.extremes.contract import Case, Finding, Subject, Tally
-from experiments.runs import Run, RunError
+from experiments.runs import Run
 from filterlab.io import save_volume
 from filterlab.io.atomic import atomic_write
 

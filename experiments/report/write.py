@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from experiments.errors import RunError
 from experiments.registry import experiment_of
 from experiments.report.page import render
-from experiments.runs import RunError, read_provenance, read_records
+from experiments.runs import read_provenance, read_records
 from filterlab.io.atomic import atomic_write
 from filterlab.io.config import load_config
 

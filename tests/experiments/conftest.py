@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -48,7 +49,15 @@ def command():
     return start
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
+@contextmanager
+def figures_left_empty():
     """Figures of reports stay empty: it takes half a second to write one, and there are tests of what is said alone."""
-    monkeypatch.setattr(Figure, "savefig", lambda _, file, **__: file.write("<svg></svg>"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", lambda _, file, **__: file.write("<svg></svg>"))
+        yield
+
+
+@pytest.fixture
+def undrawn():
+    with figures_left_empty():
+        yield

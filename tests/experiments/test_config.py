@@ -4,7 +4,8 @@ import pytest
 
 import filterlab as fl
 from experiments.__main__ import main, split_overrides
-from experiments.config import Recipe, known_configs
+from experiments.config import Recipe
+from experiments.headings import known_configs
 from experiments.registry import EXPERIMENTS, experiment_of, load
 from filterlab.io.config import ConfigError, dump_config, loads_config
 from filterlab.scenes.model import find_volume

@@ -19,8 +19,9 @@ import yaml
 import filterlab as fl
 from experiments import rms_error
 from experiments.__main__ import main
-from experiments.config import Recipe, VolumeChoice, input_files, known_configs
+from experiments.config import Recipe, VolumeChoice, input_files
 from experiments.dvr_signal import amplified_difference, displayed, image_errors
+from experiments.headings import known_configs
 from experiments.registry import EXPERIMENTS, load
 from experiments.runs import read_provenance, read_records
 from experiments.views import View
@@ -731,6 +732,27 @@ def test_list_shows_every_config(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(known_configs())
     assert all(len(line.split()) > 3 for line in lines)
+
+
+LISTED = """
+import sys
+from experiments.__main__ import main
+from experiments.registry import EXPERIMENTS
+assert main(["list"]) == 0
+assert len({*EXPERIMENTS}) == len(EXPERIMENTS) and "demo" in EXPERIMENTS and "demos" not in EXPERIMENTS
+assert not {"torch", "matplotlib", "scipy", "experiments.demo", "experiments.rms_error"} & set(sys.modules)
+"""
+
+
+def test_names_are_known_without_importing_what_they_name(command):
+    out, err = (process := command(code=LISTED)).communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert len(out.splitlines()) == len(known_configs())
+
+
+def test_no_other_experiment_is_known():
+    with pytest.raises(KeyError, match="demos"):
+        EXPERIMENTS["demos"]
 
 
 def orders(name: str, chosen: Callable[[Recipe], bool]) -> dict[str, tuple[Recipe, float, float]]:

@@ -29,6 +29,7 @@ from experiments.runs import Run, read_records
 from filterlab import kernels, signals, spectrum
 from filterlab.io.config import ConfigError
 from filterlab.methods import from_kernel
+from tests.experiments.conftest import figures_left_empty
 
 SAMPLING = Sampling(resolution=12, inner=0.4)
 WAVES = WavesClass(kind="waves", title="waves", bandwidth=0.6, waves=8)
@@ -325,7 +326,8 @@ def ran(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fit")
     path = folder / "fit.yaml"
     path.write_text(yaml.safe_dump(TINY))
-    assert main(["run", str(path), "--runs", str(folder / "runs")]) == 0
+    with figures_left_empty():
+        assert main(["run", str(path), "--runs", str(folder / "runs")]) == 0
     (run,) = (folder / "runs").iterdir()
     return run, read_records(run)[0]
 

@@ -16,6 +16,7 @@ from experiments import descent, recovery
 from experiments.__main__ import main
 from experiments.config import Recipe
 from experiments.descent import Stage, minimize, slowing
+from experiments.errors import RunError
 from experiments.inverse_dvr import Config, compute, groups, units
 from experiments.recovery import (
     Bench,
@@ -28,7 +29,7 @@ from experiments.recovery import (
     directions,
     roughness,
 )
-from experiments.runs import Run, RunError, read_records
+from experiments.runs import Run, read_records
 from filterlab import signals
 from filterlab.fields.base import Domain
 

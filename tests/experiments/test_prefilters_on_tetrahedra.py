@@ -23,6 +23,7 @@ from experiments.runs import read_records, run_file
 from filterlab import metrics, signals, spectrum
 from filterlab.io import load_image
 from filterlab.io.config import ConfigError
+from tests.experiments.conftest import figures_left_empty
 
 TINY = {
     "experiment": "prefilters_on_tetrahedra",
@@ -53,7 +54,8 @@ def ran(tmp_path_factory):
     folder = tmp_path_factory.mktemp("prefilters")
     path = folder / "tiny.yaml"
     path.write_text(yaml.safe_dump(json.loads(json.dumps(TINY))))
-    assert main(["run", str(path), "--runs", str(folder / "runs")]) == 0
+    with figures_left_empty():
+        assert main(["run", str(path), "--runs", str(folder / "runs")]) == 0
     (run,) = (folder / "runs").iterdir()
     return run, read_records(run)[0]
 

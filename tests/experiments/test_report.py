@@ -1,6 +1,9 @@
 """Reports: one self-contained file, drawn from records alone."""
 
 import re
+import shutil
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,18 +12,27 @@ import torch
 import filterlab as fl
 from experiments import registry
 from experiments.__main__ import main
+from experiments.errors import RunError
 from experiments.report import plots, style
 from experiments.report.page import Column, Gallery, Picture, Plot, Section, Table, render
 from experiments.report.write import write_report
-from experiments.runs import RunError
+from tests.experiments.conftest import TINY_RMS
 from tests.experiments.test_runs import config
 
 
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    (folder / "tiny.yaml").write_text(TINY_RMS)
+    assert main(["run", str(folder / "tiny.yaml"), "--runs", str(folder / "runs")]) == 0
+    (run,) = (folder / "runs").iterdir()
+    return run
+
+
 @pytest.fixture
-def finished(tiny_rms, tmp_path):
-    assert main(["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]) == 0
-    (folder,) = (tmp_path / "runs").iterdir()
-    return folder
+def finished(ran, tmp_path):
+    """The folder of a run, to do with as one likes."""
+    return Path(shutil.copytree(ran, tmp_path / ran.name))
 
 
 def rendered(section, **changes):
@@ -64,7 +76,7 @@ def test_numbers_methods_and_provenance_are_shown(finished):
     assert "not finished" not in page
 
 
-def test_an_unfinished_run_says_so(finished):
+def test_an_unfinished_run_says_so(undrawn, finished):
     records = finished / "records.jsonl"
     records.write_bytes(b"".join(records.read_bytes().splitlines(keepends=True)[:4]))
     page = write_report(finished).read_text()
@@ -72,7 +84,7 @@ def test_an_unfinished_run_says_so(finished):
     assert "not finished" in page
 
 
-def test_a_run_without_records_has_a_report(finished):
+def test_a_run_without_records_has_a_report(undrawn, finished):
     (finished / "records.jsonl").unlink()
     assert "0 of 9 units" in write_report(finished).read_text()
 
@@ -162,6 +174,8 @@ def test_colours_stand_out_from_the_page(background):
         assert (high + 0.05) / (low + 0.05) > 2.5
 
 
-def test_the_registry_draws_every_experiment():
-    for experiment in registry.EXPERIMENTS.values():
-        assert experiment.draw.__module__ == f"experiments.report.{experiment.name}"
+def test_the_registry_draws_every_experiment(monkeypatch, tmp_path):
+    for name, experiment in registry.EXPERIMENTS.items():
+        assert callable(import_module(f"experiments.report.{name}").draw)
+        monkeypatch.setattr(f"experiments.report.{name}.draw", lambda *given, name=name: (name, *given))
+        assert experiment.draw(None, {}, tmp_path) == (name, None, {}, tmp_path)

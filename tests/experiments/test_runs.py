@@ -13,8 +13,9 @@ import torch
 from experiments import registry
 from experiments.__main__ import main
 from experiments.config import ExperimentConfig
+from experiments.errors import RunError
 from experiments.report.page import Section, picture
-from experiments.runs import Run, RunError, Unit, _commit, config_hash, read_provenance, read_records, run_folder
+from experiments.runs import Run, Unit, _commit, config_hash, read_provenance, read_records, run_folder
 
 START = {"started": "2026-01-01T00:00:00+00:00"}
 
@@ -56,9 +57,8 @@ def count_slowly(journal, seconds):
     def units(config):
         return [Unit(str(i), str(i)) for i in range(config.count)]
 
-    registry.EXPERIMENTS["counting"] = registry.Experiment(
-        "counting", Config, units, compute, lambda *_: Section("counting")
-    )
+    counting = registry.Experiment("counting", Config, units, compute, lambda *_: Section("counting"))
+    registry.EXPERIMENTS = {"counting": counting}
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def slow(tmp_path, forks, command, monkeypatch, capsys):
     path.write_text("experiment: counting\ndescription: counts slowly\ncount: 30\n")
     journal = tmp_path / "journal"
     arguments = ["run", path, "--runs", tmp_path / "runs"]
-    monkeypatch.setattr(registry, "EXPERIMENTS", dict(registry.EXPERIMENTS))
+    monkeypatch.setattr(registry, "EXPERIMENTS", registry.EXPERIMENTS)  # as it was, afterwards
 
     def start(code=SLOW):
         return command(journal, *arguments, code=code)
@@ -229,7 +229,7 @@ def test_other_code_is_known_by_the_records_it_made(tmp_path, changed):
     assert start(None) == [5]
 
 
-def test_a_run_goes_on_with_other_code_only_with_a_warning(tiny_rms, tmp_path, monkeypatch, capsys):
+def test_a_run_goes_on_with_other_code_only_with_a_warning(undrawn, tiny_rms, tmp_path, monkeypatch, capsys):
     arguments = ["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]
     monkeypatch.setattr("experiments.runs._commit", lambda: "aaaa")
     assert main(arguments) == 0
@@ -285,7 +285,7 @@ def test_two_processes_do_not_share_a_folder(tmp_path):
         pass
 
 
-def test_what_makes_a_run_repeatable_is_written_down(tiny_rms, tmp_path):
+def test_what_makes_a_run_repeatable_is_written_down(undrawn, tiny_rms, tmp_path):
     assert main(["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]) == 0
     (folder,) = (tmp_path / "runs").iterdir()
     (start,) = read_provenance(folder)
@@ -297,7 +297,7 @@ def test_what_makes_a_run_repeatable_is_written_down(tiny_rms, tmp_path):
     assert "boundary: reflect" in (folder / "config.yaml").read_text()  # a default, written out
 
 
-def test_a_finished_run_is_not_computed_again(tiny_rms, tmp_path, monkeypatch, capsys):
+def test_a_finished_run_is_not_computed_again(undrawn, tiny_rms, tmp_path, monkeypatch, capsys):
     arguments = ["run", str(tiny_rms), "--runs", str(tmp_path / "runs")]
     assert main(arguments) == 0
     (folder,) = (tmp_path / "runs").iterdir()
