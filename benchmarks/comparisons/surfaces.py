@@ -19,6 +19,7 @@ from benchmarks.probe import measured
 from benchmarks.records import Figure, Outcome, Spread, at_least, at_most
 from benchmarks.scene import marschner_lobb
 from benchmarks.settings import Settings
+from filterlab.fields.base import Field
 from filterlab.methods import METHODS, reconstruct
 from filterlab.render.materials import Phong
 from filterlab.render.raycast import raycast
@@ -42,6 +43,7 @@ _BORDER = (
 )
 _BISECTED = 32  # pixels along an edge of what isoray casts
 _PLAIN = 64  # pixels along an edge of what plain torch casts
+_SHEETS = 8
 
 
 def described(task: Casting) -> str:
@@ -136,6 +138,23 @@ def _plain(settings: Settings) -> Race:
     return Race(f"{described(task)}: first hits and normals", contestants, ratios)
 
 
+def _sheets(settings: Settings) -> Race:
+    """All sheets of few rays, by the program and by plain torch from the pieces that it finds."""
+    task = task_of(settings, settings.image)
+    contestants, ratios = [], []
+    for method in ("trilinear", "triquadratic", "tricubic"):
+        surface = surface_of(task, method)
+        contestants += [_listed(task, surface, f"{method}, {how}", how) for how in ("fused", "plain roots")]
+        ratios.append(Ratio(f"{method}, fused", f"{method}, plain roots"))
+    return Race(f"{described(task)}: {_SHEETS} sheets", contestants, ratios)
+
+
+def _listed(task: Casting, surface: LevelSet, name: str, how: str) -> Contestant:
+    field, level = surface.field, task.level
+    cast = field.crossings if how == "fused" else partial(Field.crossings, field)
+    return Contestant(name, lambda: cast(task.origins, task.directions, level, _SHEETS, False), samples=task.rays)
+
+
 def ways_of(task: Casting) -> tuple[Callable[[], Any], Callable[[], Any]]:
     """Depths and normals forward, and with gradients to samples and origins.
 
@@ -222,6 +241,7 @@ def _items(settings: Settings) -> list[Item]:
         race_item("images", 20, _renderers),
         race_item("new-level", 30, _new_level),
         race_item("plain", 60, _plain),
+        race_item("sheets", 30, _sheets),
         race_item("backward", 10, _backward),
         race_item("threads", 5, _threads, threads=usable_cores()),
         race_item("pixels", 5, lambda s: _growth(s, "pixels")),

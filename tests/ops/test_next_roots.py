@@ -86,7 +86,7 @@ def polynomials(rng: np.random.Generator, degree: int, count: int, twice: bool) 
     roots = np.sort(rng.uniform(0.03, 0.97, (8 * count, degree)), 1)
     roots[rng.random(roots.shape) < 0.4] += 1.5
     if twice:
-        roots[:, 1] = roots[:, 0]
+        roots[:, -1] = roots[:, -2]  # behind a single one it is met from below
     inside = np.sort(np.where(roots < 1, roots, np.inf), 1)
     apart = np.diff(np.where(inside < 1, inside, 2 + np.arange(degree)), axis=1)
     good = roots[((apart > 0.05) | (apart == 0)).all(1)][:count]
