@@ -41,6 +41,7 @@ class Subject:
         weights: (P,), summing to 1.
         value, gradient: of the truth there, the gradient per voxel; float64.
         second_derivative: of the truth along a line in a random direction, (P,).
+        signal: the truth, anywhere.
         differentiable: whether gradients count; a step has none.
     """
 
@@ -51,6 +52,7 @@ class Subject:
     value: Tensor
     gradient: Tensor
     second_derivative: Tensor
+    signal: Signal
     differentiable: bool = True
 
 
@@ -367,7 +369,7 @@ def _subject(
     ahead, behind = (signal.value_and_gradient(points.double() + sign * _APART / 2 * along)[1] for sign in (1, -1))
     bent = ((ahead - behind) * along).sum(-1) / _APART
     size = "×".join(str(n) for n in reversed(volume.shape))
-    return Subject(f"{label} {size}".strip(), volume, points, weights, value, gradient, bent, differentiable)
+    return Subject(f"{label} {size}".strip(), volume, points, weights, value, gradient, bent, signal, differentiable)
 
 
 def _points(

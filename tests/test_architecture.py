@@ -162,7 +162,9 @@ def test_a_circle_is_found(tmp_path):
 
 def test_every_op_has_its_parts():
     """A description, a plain twin, vector code, and what makes it differentiable; on a GPU as far as there is one."""
-    for op in ("gather", "place", "prefilter", "march", "projection", "raycast", "hit_points", "quadrics", "slim"):
+    cast = ("raycast", "vectors", "hit_points", "quadrics", "slim")
+    ops = ("gather", "place", "prefilter", "march", "projection", *cast)
+    for op in ops:
         for room in ("", "reference", "cpu", "differentiable"):
             assert (PACKAGE / "ops" / room / f"{op}.py").is_file(), f"{op} has no {room or 'description'}"
 

@@ -328,7 +328,7 @@ def test_rays_of_any_shape_and_memory_by_parts(scheme, monkeypatch):
     origins, directions = random_rays(4, 60)
     t = surface.hit(origins, directions).t
     sheets = surface.hits(origins, directions, 3)
-    monkeypatch.setattr("filterlab.surfaces.level_set.RAYS_AT_ONCE", 7)
+    monkeypatch.setattr("filterlab.ops.reference.raycast.RAYS_AT_ONCE", 7)
     monkeypatch.setattr("filterlab.ops.reference.raycast.PIECES_AT_ONCE", 100)
     monkeypatch.setattr("filterlab.ops.raycast._NUMBERS_AT_ONCE", 100)
     shaped = origins.reshape(3, 4, 5, 3), directions.reshape(3, 4, 5, 3)

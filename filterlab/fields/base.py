@@ -15,7 +15,7 @@ from torch import Tensor
 from filterlab.arrays import Array, as_tensor
 from filterlab.geometry import Geometry
 from filterlab.ops.pieces import Pieces
-from filterlab.ops.raycast import Candidates
+from filterlab.ops.raycast import Candidates, Sheets
 from filterlab.ops.reference import raycast
 
 
@@ -141,6 +141,21 @@ class Field(ABC):
             TypeError, ValueError: as `pieces_along` does.
         """
         return raycast.first_of(self._candidates_at(level), origins, directions, self._most_pieces())
+
+    def crossings(self, origins: Tensor, directions: Tensor, level: float, count: int, farthest: bool) -> Tensor:
+        """Where rays meet a level: t (..., count) float64, in order, or from the last on; ∞ where there are no more.
+
+        Args:
+            origins, directions: as for `first_crossing`.
+
+        Raises:
+            TypeError, ValueError: as `pieces_along` does.
+        """
+        search = lambda o, d: self.crossing_candidates(o, d, level)  # noqa: E731
+        return raycast.sheets_by(search, origins, directions, self._sheets(count, farthest))
+
+    def _sheets(self, count: int, farthest: bool) -> Sheets:
+        return Sheets(count, farthest, self.domain.diagonal)
 
     def crossing_candidates(self, origins: Tensor, directions: Tensor, level: float) -> Candidates:
         """The pieces of rays that may hold a crossing of a level, those of a ray in order; the others hold none."""

@@ -23,7 +23,9 @@ from filterlab.fields.storage import Quantization, stored_as
 from filterlab.geometry import Geometry
 from filterlab.kernels import Factor, Kernel, PiecewisePolynomial
 from filterlab.ops.differentiable import raycast as casting
+from filterlab.ops.differentiable.drivers import room_of
 from filterlab.ops.differentiable.prefilter import implementation_for
+from filterlab.ops.differentiable.recording import plain
 from filterlab.ops.pieces import Lattice, Pieces
 from filterlab.ops.place import Placement
 from filterlab.ops.prefilter import VOLUME
@@ -231,9 +233,7 @@ def _extended(values: Tensor, dims: list[int], boundary: Boundary, reach: int) -
 
 def implementation_of(scheme: str, device: torch.device) -> str:
     """What computes a scheme's sums: for `fused` vector code on the CPU and Triton on a GPU, else plain torch."""
-    if scheme != "fused":
-        return "reference"
-    return "cuda" if device.type == "cuda" else "cpu"
+    return room_of(device) if scheme == "fused" else "reference"
 
 
 def _apply_factor(values: Tensor, dims: list[int], factor: Factor) -> Tensor:
@@ -376,6 +376,10 @@ class GridField(Field):
     def first_crossing(self, origins: Tensor, directions: Tensor, level: float) -> Tensor:
         return casting.first(self._raycast(level, origins, directions), origins, directions, self._caster)
 
+    def crossings(self, origins: Tensor, directions: Tensor, level: float, count: int, farthest: bool) -> Tensor:
+        given = self._raycast(level, origins, directions)
+        return casting.sheets(given, origins, directions, self._sheets(count, farthest), self._caster)
+
     def crossing_candidates(self, origins: Tensor, directions: Tensor, level: float) -> Candidates:
         return casting.candidates(self._raycast(level, origins, directions), origins, directions, self._caster)
 
@@ -419,8 +423,8 @@ class GridField(Field):
         out = [value.squeeze(axis)]
         if order >= 1:
             gradient = others[0].movedim(axis, -1)
-            if sign is not None:
-                gradient = gradient * sign
+            if sign is not None:  # nobody else has rows that nothing is recorded of: new memory takes twice the time
+                gradient = gradient.mul_(sign) if plain(gradient) else gradient * sign
             out.append(self.domain.geometry.gradient_to_world(gradient))
         if order >= 2:
             hessian = _symmetric(others[1], axis)

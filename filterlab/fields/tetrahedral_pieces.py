@@ -134,6 +134,12 @@ class FieldOnTetrahedra(GridField):
             return Field.first_crossing(self, origins, directions, level)
         return casting.first(given, origins, directions)
 
+    def crossings(self, origins: Tensor, directions: Tensor, level: float, count: int, farthest: bool) -> Tensor:
+        given = self._program(level, origins, directions)
+        if given is None:
+            return Field.crossings(self, origins, directions, level, count, farthest)
+        return casting.sheets(given, origins, directions, self._sheets(count, farthest))
+
     def crossing_candidates(self, origins: Tensor, directions: Tensor, level: float) -> Candidates:
         given = self._program(level, origins, directions)
         if given is None:

@@ -28,9 +28,9 @@ by what rounding may do to coefficients.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import accumulate
 
 import torch
@@ -136,14 +136,19 @@ class Pyramid:
         return self.numbers[self.starts[number] : self.starts[number + 1]].unflatten(0, self.sizes[number])
 
     @classmethod
-    def room(cls, heights: Heights, finest: int) -> Pyramid:
-        """To be written: the first level, then `complete`."""
+    def room(cls, heights: Heights, finest: int, allocated: Callable[..., Tensor] | None = None) -> Pyramid:
+        """To be written: the first level, then `complete`.
+
+        Args:
+            allocated: makes the memory, of a shape and a type; None: where the heights are.
+        """
         columns, rows = heights.cells
         sizes = [(-(-rows // (1 << finest)), -(-columns // (1 << finest)))]
         while max(sizes[-1]) > 1:
             sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
         count = sum(r * c for r, c in sizes)
-        return cls(torch.empty(count, 2, device=heights.values.device), tuple(sizes), finest)
+        allocated = allocated or partial(torch.empty, device=heights.values.device)
+        return cls(allocated((count, 2), dtype=torch.float32), tuple(sizes), finest)
 
     def complete(self) -> Pyramid:
         """The same, with all levels made from the first."""

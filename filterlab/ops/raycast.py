@@ -1,7 +1,8 @@
 """Casting rays at a level, described: which crossings of a piecewise polynomial are asked for.
 
     first        where each ray meets the level first
-    candidates   all pieces that may hold a crossing, in order, for whoever wants every one
+    sheets       where each ray meets it, the first k times or the last
+    candidates   all pieces that may hold a crossing, in order
 
 `ops.reference.raycast` says what is computed, from any pieces; the programs walk through the cells of a lattice and
 restrict only those that their bricks' bounds leave over.
@@ -26,9 +27,43 @@ JUMP, REPEATED = 1, 2  # bits of `Written.flags`
 PASSES = 120  # of Newton's method and bisection
 USUAL = 2  # passes before a value that may be rounding decides anything
 
+PLACES_APART = 32  # roundings of a place on a ray, up to which two are the same
+
+_ALL = 1 << 62  # crossings, more than any ray has
 RADII = (1, 2, 3, 4, 5, 6, 7, 8)  # bricks around an empty one that are told to be empty as well
 _FEW = 4  # candidates of a ray at first; those with more are cast again
 _NUMBERS_AT_ONCE = 1 << 24  # of candidates
+
+
+@dataclass(frozen=True)
+class Sheets:
+    """Which of all crossings are asked for.
+
+    Attributes:
+        count: k, of each ray.
+        farthest: the last ones, from the last on; else the first ones in order.
+        extent: the diagonal of the domain, in the world: what the rounding of places is measured by.
+    """
+
+    count: int
+    farthest: bool
+    extent: float
+
+    @property
+    def most(self) -> int:
+        """Crossings of a ray behind which no more are looked for."""
+        return _ALL if self.farthest else self.count
+
+    def room(self, rays: torch.Size, device: torch.device) -> tuple[Tensor, Tensor]:
+        """t (..., k) and numbers (..., 1) of crossings, for programs to write: crossing i of a ray at i mod k."""
+        t = torch.full((*rays, self.count), torch.inf, dtype=torch.float64, device=device)
+        return t, torch.zeros((*rays, 1), dtype=torch.int64, device=device)
+
+    def in_order(self, t: Tensor, found: Tensor) -> Tensor:
+        """t (..., k) as asked for, from what programs have written."""
+        if not self.farthest:
+            return t
+        return t.gather(-1, (found - 1 - torch.arange(self.count, device=t.device)) % self.count)
 
 
 class Candidates(NamedTuple):

@@ -24,9 +24,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.arrays import Array, all_finite, as_tensor
+from filterlab.arrays import Array, as_tensor
 from filterlab.fields.base import Domain, check_order, type_of_rays
-from filterlab.ops.differentiable import hit_points
+from filterlab.ops.differentiable import hit_points, vectors
 from filterlab.ops.differentiable.recording import plain, transforming
 from filterlab.ops.reference.hit_points import along, chosen, length, spread
 
@@ -347,7 +347,7 @@ class Surface(ABC):
 
     def _far_from(self, origins: Tensor) -> bool:
         """Whether any of some rays begins farther away."""
-        return max(map(abs, torch.stack(origins.detach().aminmax()).tolist())) > self._reach
+        return vectors.facts(origins).greatest > self._reach
 
     def _nearer(self, points: Tensor, directions: Tensor, piece: Tensor | None) -> Tensor:
         """By what points (M, 3) come nearer to the surface along rays: steps of Newton's method that lower |F|."""
@@ -416,12 +416,13 @@ def check_rays(origins: Array, directions: Array) -> tuple[Tensor, Tensor]:
     """Both (..., 3), broadcast, in promote(origins, directions, float32). Raises what `Surface.hit` says."""
     origins, directions = as_tensor(origins), as_tensor(directions)
     rays = _broadcast(origins, directions)
+    known = {"origins": vectors.facts(origins), "directions": vectors.facts(directions)}
     for name, x in (("origins", origins), ("directions", directions)):
-        if not all_finite(x):
+        if not known[name].finite:
             wrong = int((~x.detach().isfinite()).any(-1).sum())
             raise ValueError(f"{name} must be finite; {wrong} rays are not")
-    some_zero = int(directions.detach().count_nonzero()) < directions.numel()
-    if some_zero and (none := int((directions.detach() == 0).all(-1).sum())):
+    if known["directions"].none:
+        none = int((directions.detach() == 0).all(-1).sum())
         raise ValueError(f"directions must not be zero; {none} rays have none")
     return rays
 

@@ -35,12 +35,12 @@ from filterlab.ops import heights as described
 from filterlab.ops.differentiable import height_hits as ops
 from filterlab.ops.differentiable import heights as jets
 from filterlab.ops.gather import STORAGE
+from filterlab.ops.raycast import Sheets
 from filterlab.ops.reference import heights as reference
+from filterlab.ops.reference.raycast import sheets_by
 from filterlab.surfaces import sight
 from filterlab.surfaces.base import Hits, Surface, check_rays
-from filterlab.surfaces.level_set import RAYS_AT_ONCE
 from filterlab.surfaces.relief import Relief
-from filterlab.surfaces.sheets import sheets_of
 from filterlab.volume import Boundary
 
 _TYPES = {*STORAGE, torch.int64}
@@ -298,13 +298,9 @@ class HeightField(Surface):
         return Hits(ops.first(self.cast, origins.reshape(-1, 3), directions.reshape(-1, 3)))
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-        return Hits(torch.cat([self._sheets_of_part(o, d, sheets, farthest) for o, d in parts]))
-
-    def _sheets_of_part(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
-        found = ops.candidates(self.cast, origins, directions)
-        extent = self.domain.diagonal / directions.abs().amax(-1).double()
-        return sheets_of(found, extent, sheets, farthest)
+        search = lambda o, d: ops.candidates(self.cast, o, d)  # noqa: E731
+        asked = Sheets(sheets, farthest, self.domain.diagonal)
+        return Hits(sheets_by(search, origins, directions, asked))
 
     def met(self, origins: Array, directions: Array) -> Tensor:
         origins, directions = check_rays(origins, directions)

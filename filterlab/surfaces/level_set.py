@@ -29,9 +29,6 @@ from torch import Tensor
 from filterlab.fields.base import Field, Relevant
 from filterlab.roots import MAX_DEGREE
 from filterlab.surfaces.base import Hits, Surface
-from filterlab.surfaces.sheets import sheets_of
-
-RAYS_AT_ONCE = 1 << 16  # whose sheets are sorted
 
 
 class LevelSet(Surface):
@@ -92,19 +89,7 @@ class LevelSet(Surface):
         return Hits(self.field.first_crossing(origins, directions, self._number))
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
-        return Hits(torch.cat([self._sheets_of_part(o, d, sheets, farthest) for o, d in parts]))
-
-    def _sheets_of_part(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Tensor:
-        found = self.field.crossing_candidates(origins, directions, self._number)
-        extent = self._extent / directions.abs().amax(-1).double()
-        return sheets_of(found, extent, sheets, farthest)
-
-    @cached_property
-    def _extent(self) -> float:
-        """The diagonal of the domain, in the world."""
-        corners = self.domain.corners()
-        return float((corners - corners[:1]).norm(dim=-1).max())
+        return Hits(self.field.crossings(origins, directions, self._number, sheets, farthest))
 
 
 def _checked(field: Field) -> Field:

@@ -7,11 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from torch import Tensor
 
-from experiments.recommend_validation import HALVES, Truth, fitted, judged
+import filterlab as fl
+from experiments.recommend_validation import HALVES, Picture, Truth, fitted, judged
 from experiments.report.recommend_validation import BARS, _met, _verdict, outcomes
+from experiments.variety import Subject
 from filterlab.recommendation import Candidate, ErrorEstimate, Recommendation
 from filterlab.recommendation.calibration import CALIBRATION, FALLS
+from filterlab.signals import Signal, ValueAndGradient
 
 
 def candidate(method: str, seconds: float, low: float, high: float) -> Candidate:
@@ -71,6 +76,45 @@ def test_truths_are_counted_as_the_task_counts() -> None:
     assert truth.counted("dvr", 0.5) == pytest.approx(math.hypot(0.03, 0.25 / 24 * 2.4))
 
 
+def of_function(function: ValueAndGradient, n: int, random: np.random.Generator) -> Subject:
+    """A volume of n³ exact samples, known at random points."""
+    signal = Signal("known", function)
+    points = torch.tensor(random.random((4096, 3))) * (n - 1)
+    value, gradient = signal.value_and_gradient(points)
+    weights = torch.full((4096,), 1 / 4096, dtype=torch.float64)
+    grid = torch.stack(torch.meshgrid(*[torch.arange(float(n), dtype=torch.float64)] * 3, indexing="ij"), -1).flip(-1)
+    volume = signal.value_and_gradient(grid)[0]
+    return Subject("known", volume, points, weights, value, gradient, torch.zeros(4096), signal)
+
+
+def test_a_picture_judges_what_its_rays_hit() -> None:
+    """A ball of radius 4 in the middle, exact, and 2 % too small."""
+    center, n = torch.tensor([8.0, 8.0, 8.0], dtype=torch.float64), 17
+
+    def ball(p: Tensor) -> tuple[Tensor, Tensor]:
+        away = p - center
+        return away.square().sum(-1), 2 * away
+
+    random = np.random.default_rng(3)
+    subject = of_function(ball, n, random)
+    picture = replace(Picture.of(subject, 1.0, random), level=16.0)
+    assert (picture.directions.norm(dim=-1) > 0).all()
+    ends = torch.stack([picture.origins, picture.origins + picture.directions])
+    assert ends.min() >= 0.35 - 1e-9  # the region: 0.9 of −½ … 16½
+    assert ends.max() <= 15.65 + 1e-9
+    exact = fl.reconstruct(subject.volume, "catmull-rom")
+    found = picture.error(exact)
+    assert found is not None
+    assert found < 1e-10  # of a quadratic
+    off = fl.reconstruct(subject.volume * 0.98, "catmull-rom")
+    # hits at |p − c|² = 16 / 0.98: value off by 0.02 · 16 / 0.98, gradient by 0.02 · 2 · 4 / √0.98
+    assert picture.error(off) == pytest.approx(max(0.32 / 0.98, 0.16 / math.sqrt(0.98)), rel=1e-4)
+    assert replace(picture, level=-1.0).error(exact) is None
+    nearest = picture.error(fl.reconstruct(subject.volume, "nearest"))
+    assert nearest is not None
+    assert nearest > 1  # its surface lies between voxels, and it has no gradient
+
+
 # --- calibration ------------------------------------------------------------------------------------------------------
 
 
@@ -113,12 +157,17 @@ def test_outcomes_of_a_volume() -> None:
         {"task": "dvr", "picked": False, "kept": None, "justified": True, "factor": None, "undecided": False},
         {"task": "dvr", "picked": False, "kept": None, "justified": False, "factor": None, "undecided": True},
     ]
-    answers = [{"near": i == 2, **a} for i, a in enumerate(answers)]
+    pictured = {"kept": None, "justified": False}
+    seen = {"task": "isosurface", "picked": False, "justified": True, "undecided": False, "pictured": pictured}
+    seen_pick = {"task": "isosurface", "picked": True, "factor": None, "kept": False, "pictured": {"kept": True}}
+    answers = [{"near": i == 2, **a} for i, a in enumerate([*answers, seen, seen_pick])]
     found = {"ways": [{**way, "resample": [0.4, 0.6], "isosurface": [0.0, 1.9]}], "answers": answers}
     counted = outcomes({"differentiable": True}, found)
     assert counted["holds"] == [True, False]
-    assert (counted["kept"], counted["near"]) == ([False], [False])
-    assert (counted["justified"], counted["hard"], counted["sure"]) == ([True], [False], [True])
+    assert (counted["kept"], counted["near"]) == ([False, False], [False])
+    assert (counted["justified"], counted["hard"], counted["sure"]) == ([True, True], [False], [True, True])
+    assert counted["kept in pictures"] == [True]
+    assert counted["justified in pictures"] == counted["sure in pictures"] == [False]
     assert outcomes({"differentiable": False}, found)["holds"] == [True]
     assert outcomes({"differentiable": True}, found, "isosurface")["holds"] == [False]
 

@@ -17,7 +17,7 @@ from filterlab.methods import from_kernel
 from filterlab.ops.cuda import crossings, launch
 from filterlab.ops.cuda import raycast as cuda
 from filterlab.ops.differentiable import raycast
-from filterlab.ops.raycast import Raycast
+from filterlab.ops.raycast import Raycast, Sheets
 from tests.ops.front_end import intermediate
 from tests.ops.test_raycast import (
     AFFINE,
@@ -27,6 +27,7 @@ from tests.ops.test_raycast import (
     rays_through_a_level_between_cells,
     samples,
 )
+from tests.ops.test_sheets import along_z, parabola, up_and_down
 from tests.test_methods import TENSOR_PRODUCTS
 
 FEW, MANY = 33, 20_000  # the interpreter takes 50 ms for a ray; 33 are more than a program has
@@ -122,6 +123,40 @@ def test_rays_on_the_last_faces_of_the_domain(device: str) -> None:
     assert torch.allclose(found, raycast.first(given, o, d, "reference"), rtol=0, atol=1e-12)
 
 
+def assert_the_same_sheets(given: Raycast, o: Tensor, d: Tensor, asked: Sheets, device: str) -> Tensor:
+    expected = raycast.sheets(given, o, d, asked, "reference")
+    found = cuda.sheets(on(device, given), o.to(device), d.to(device), asked).cpu()
+    hit = expected < torch.inf
+    assert torch.equal(hit, found < torch.inf)
+    assert float((expected - found)[hit].abs().max()) <= 1e-11
+    return found
+
+
+@pytest.mark.parametrize("method", TENSOR_PRODUCTS)
+def test_the_same_sheets(method: str, device: str) -> None:
+    if device == "cpu" and method != "trilinear":
+        pytest.skip("the interpreter takes the smallest")
+    field = fl.reconstruct(fl.Volume(samples(), affine=AFFINE), method)
+    given, (o, d) = described(field), rays(field, 12 if device == "cpu" else MANY // 10)
+    found = assert_the_same_sheets(given, o, d, Sheets(3, False, 20.0), device)
+    assert torch.equal(found[:, 0], cuda.first(on(device, given), o.to(device), d.to(device)).cpu())
+    assert_the_same_sheets(given, o, d, Sheets(2, True, 20.0), device)
+
+
+@pytest.mark.parametrize("values", [[0.0, 1, 2, 2, 2, 3], [0.0, 2, 0, 2, 3, 2]])
+def test_sheets_on_stretches_and_corners(values: list[float], device: str) -> None:
+    assert_the_same_sheets(*up_and_down(along_z(values), 2.0), Sheets(5, False, 20.0), device)
+
+
+@pytest.mark.parametrize("depth", [1e-16, 1e-10, -1e-10])
+def test_sheets_at_two_roots_that_are_nearly_one(depth: float, device: str) -> None:
+    given, o, d = up_and_down(along_z(parabola(), "triquadratic", boundary="border"), depth)
+    expected = raycast.sheets(given, o, d, Sheets(3, False, 20.0), "cpu")
+    found = cuda.sheets(on(device, given), o.to(device), d.to(device), Sheets(3, False, 20.0)).cpu()
+    assert torch.equal(found < torch.inf, expected < torch.inf)
+    assert torch.allclose(found, expected, rtol=0, atol=1e-7)
+
+
 def test_no_rays(device: str) -> None:
     field = fl.reconstruct(samples(), "trilinear")
     given, (o, d) = described(field), rays(field, 0)
@@ -170,8 +205,11 @@ def test_compiles_for_a_gpu_that_need_not_be_there(method: str, asked: str, taps
     assert sum("ld.global.b32" in line for line in lines) == 6 + taps  # of a ray, and of a cell or a cube
 
 
-@pytest.mark.parametrize(("method", "asked"), [("cubic-c1", "candidates"), ("quadratic-c1", "first")])
-def test_is_taken_by_the_compilers_front_end(method: str, asked: str, compiling: None) -> None:
+@pytest.mark.parametrize(
+    ("method", "asked", "loops"),
+    [("cubic-c1", "candidates", 3), ("quadratic-c1", "first", 5), ("trilinear", "sheets", 8)],
+)
+def test_is_taken_by_the_compilers_front_end(method: str, asked: str, loops: int, compiling: None) -> None:
     """That of types and loops: what comes behind it takes 6 to 12 s for these programs."""
     made = intermediate(program_of(method, asked))
-    assert made.count("scf.while") == (3 if asked == "candidates" else 5)
+    assert made.count("scf.while") == loops

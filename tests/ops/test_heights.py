@@ -185,7 +185,7 @@ def test_scattered_points_are_asked_for_and_sorted_without_a_bit_of_difference(m
     points = places(2, 1000, 120.0).to(dtype)
     points[0, 3], points[1, 7, 1] = torch.nan, torch.inf
     heights, cotangents = given(SPLINES["c1"], values, Boundary.ZEROS), random(2, 3, 1000, seed=5, dtype=dtype) - 0.5
-    monkeypatch.setattr(cpu_heights, "_EDGE", 8)
+    monkeypatch.setattr(cpu_heights, "_TILE", (16, 4))
     monkeypatch.setattr(cpu_order, "POINTS_AT_ONCE", 600)
     found = []
     for asked, sorted_ in ((False, False), (True, False), (True, True)):
@@ -200,17 +200,25 @@ def test_scattered_points_are_asked_for_and_sorted_without_a_bit_of_difference(m
 
 
 def test_which_points_are_sorted():
-    """Many of a large grid that lie all over it, where patches need many data."""
+    """Many of a large grid, where patches are no planes; whether they lie all over it is asked before."""
     values, many = torch.zeros(1, 800, 800), 1 << 16
-    points = places(1, many, 800.0).float()
-    ask = lambda spline, values, points: cpu_heights._sorting_pays(given(spline, values), values, points)  # noqa: E731
-    assert ask(SPLINES["c1"], values, points)
-    assert not ask(SPLINES["linear"], values, points)
-    assert not ask(SPLINES["c1"], values[:, :600], points)
-    assert not ask(SPLINES["c1"], values, points[:, 1:])
-    assert not ask(SPLINES["c1"], values, points.sort(1).values)
-    assert cpu_heights._scattered(given(SPLINES["linear"], values), values, points)
-    assert not cpu_heights._scattered(given(SPLINES["linear"], values), values, points.sort(1).values)
+    points, heights = places(1, many, 800.0).float(), given(SPLINES["c1"], values)
+    assert cpu_heights._sorting_pays(heights, values, points)
+    assert not cpu_heights._sorting_pays(given(SPLINES["linear"], values), values, points)
+    assert not cpu_heights._sorting_pays(heights, values[:, :600], points)
+    assert not cpu_heights._sorting_pays(heights, values, points[:, 1:])
+    assert cpu_heights._scattered(heights, values, points)
+    assert not cpu_heights._scattered(heights, values, points.sort(1).values)
+
+
+@pytest.mark.parametrize("boundary", list(Boundary))
+@pytest.mark.parametrize("spline", ["linear", "c1"])
+def test_points_farther_away_than_integers_count(spline, boundary):
+    """Every boundary puts them somewhere, and never reads beside the grid."""
+    far = torch.tensor([2.0**e * sign + off for e in (20, 31, 32, 40) for sign in (-1, 1) for off in (-300, 0.25, 5)])
+    points = torch.stack((far, far.flip(0)), -1)[None].double()
+    heights = given(SPLINES[spline], random(1, 6, 7), boundary)
+    close(ops.jet(heights, points, 1, "cpu"), ops.jet(heights, points, 1, "reference"), 1e-6)
 
 
 def test_what_runs_it():

@@ -4,10 +4,11 @@
                                                                 │
     tensors ──▶ job ────────────────────────────threads─────────┴──▶ result
 
-`gather`, `place`, `prefilter`, `contract`, `march`, `projection`, `raycast`, `hit_points`, `quadrics`, `heights` and
-`bounds` describe arrays to programs as jobs and run them; `points`, `folding`, `recursion`, `contraction`,
-`compositing`, `largest`, `crossings`, `hit_rows`, `quadric_hits`, `height_jets` and `hulls` write those programs, from
-the sums of `taps` (read it first, its head explains how they are computed) and the single instructions of `lanes`.
+`gather`, `place`, `prefilter`, `contract`, `march`, `projection`, `raycast`, `vectors`, `hit_points`, `quadrics`,
+`heights` and `bounds` describe arrays to programs as jobs and run them; `points`, `folding`, `recursion`,
+`contraction`, `compositing`, `largest`, `crossings`, `vector_bits`, `hit_rows`, `quadric_hits`, `height_jets` and
+`hulls` write those programs, from the sums of `taps` (read it first, its head explains how they are computed) and the
+single instructions of `lanes`.
 `compiler` and `cache` make and keep machine code, `threads` runs it. What is here can be asked without llvmlite:
 whether they can run at all.
 """

@@ -12,6 +12,10 @@ For a pack of P rays, until all have ended:
                 several: the part that holds the first root is looked for at once (`ops.cpu.polynomials`)
 
 and then one root search for all of them. Pieces that hold no level never come to it.
+
+Where every crossing is asked for, a ray goes on with a part in which it has a root, and only when one comes to its next
+root are those of the whole pack searched and written: a pack of rays costs about as many searches as one of them has
+roots. A ray that has all that were asked for, when those it waits with are counted, waits.
 """
 
 from __future__ import annotations
@@ -26,11 +30,11 @@ from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.cells import Found, Gathered, Walk
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, I8, I32, I64, STORAGE, Lanes, Value
-from filterlab.ops.cpu.polynomials import FirstRoot, Part, Rows
+from filterlab.ops.cpu.polynomials import FirstRoot, NextRoots, Part, Rows
 from filterlab.ops.cpu.restriction import Restriction, Section
 from filterlab.ops.cpu.taps import Grid
 from filterlab.ops.cpu.tetrahedral_restriction import Level, TetrahedralRestriction
-from filterlab.ops.raycast import JUMP, REPEATED
+from filterlab.ops.raycast import JUMP, PLACES_APART, REPEATED
 from filterlab.ops.tetrahedra import LoweredStencil, TetrahedralStencil
 
 PACKS_OF_A_CHUNK = 16
@@ -59,9 +63,12 @@ FIELDS: dict[str, type] = {
     "marks": ctypes.c_void_p,  # (bz, by, bx) 16 bits, see `ops.raycast.Raycast`
     **{f"bricks_{a}": ctypes.c_int64 for a in AXES},  # their number
     "edge": ctypes.c_int64,  # of a brick, log₂ of its cells
-    "t": ctypes.c_void_p,  # (R) d, written: where the first hit is
+    "t": ctypes.c_void_p,  # (R) d, written: where the first hit is; (R, k) where sheets are
+    "sheets": ctypes.c_int64,  # k, places for sheets of a ray, which are written in a ring
+    "most": ctypes.c_int64,  # sheets behind which no more are looked for
+    "extent": ctypes.c_double,  # the diagonal of the domain, in the world
     "capacity": ctypes.c_int64,  # K, candidates of a ray that there is room for
-    "count": ctypes.c_void_p,  # (R) int64, written: candidates of a ray, also those that there is no room for
+    "count": ctypes.c_void_p,  # (R) int64, written: candidates or sheets of a ray, also those that there is no room for
     "places": ctypes.c_void_p,  # (R, K, 3) d, written: start, near, far of candidates
     "pieces": ctypes.c_void_p,  # (R, K, n + 1) numbers, written: Bernstein coefficients of f − level
     "flags": ctypes.c_void_p,  # (R, K) bytes, written: 1 the field jumps over the level, 2 the piece is a repetition
@@ -78,7 +85,7 @@ class RaycastVariant:
     """Everything the program depends on, apart from the machine.
 
     Attributes:
-        asked: "first" or "candidates".
+        asked: "first", "candidates" or "sheets".
         stencil: the sum over taps, one row.
         degree: n, along a ray.
         continuous: whether polynomials of neighbouring cells agree where they meet.
@@ -100,7 +107,7 @@ class RaycastVariant:
     def generate(self) -> str:
         """The program as LLVM IR text."""
         module, function = frame.new_module()
-        (_First if self.asked == "first" else _Candidates)(self, function).write()
+        _PROGRAMS[self.asked](self, function).write()
         return str(module)
 
 
@@ -140,7 +147,6 @@ class _Program:
         grid = Grid(j.width, j.height, I64(0), no_ends, no_ends)
         self.level = Level(*(e.everywhere(e.scalar(x)) for x in (j.scale, j.shift, j.margin)))
         self.restriction = self._restriction_of(v.stencil, grid)
-        self.search = FirstRoot(e, v.degree)
         self.walk = Walk(self.places, j)
         self._ended_at = self.places.variable(self.places.constant(-1))
         self._ended_with = e.variable(e.constant(0))
@@ -183,6 +189,10 @@ class _Program:
         """A mask of rays that need not go on."""
         return self.walk.mask(False)
 
+    def done(self) -> Value:
+        """A mask of rays that want no more pieces, not even of the cell that they are in."""
+        return self.waiting()
+
     def take(self, rays: Sequence[Value], piece: Piece) -> None:
         """Pieces that were found, of rays of those numbers."""
         raise NotImplementedError
@@ -193,19 +203,23 @@ class _Program:
     # --- a pack of rays ---
 
     def _cast(self, rays: Sequence[Value]) -> None:
-        e, b, walk = self.lanes, self.builder, self.walk
         self.begin()
         self._ended_at.value = self.places.constant(-1)
-        walk.begin(*(self._vectors(array, rays) for array in (self.job.origins, self.job.directions)))
-        going = lambda: e.any(b.and_(walk.going.value, b.not_(self.waiting())))  # noqa: E731
-        with e.repeat_while(going):
+        origins, directions = (self._vectors(array, rays) for array in (self.job.origins, self.job.directions))
+        self.walk.begin(origins, directions)
+        self.along(rays, directions)
+        self.finish(rays)
+
+    def along(self, rays: Sequence[Value], directions: Sequence[Value]) -> None:
+        """Take all pieces of a pack of rays, those of a ray in order, until it ends or waits."""
+        e, b = self.lanes, self.builder
+        with e.repeat_while(lambda: e.any(b.and_(self.walk.going.value, b.not_(self.waiting())))):
             found = self._next_cells()
             with (
                 b.if_then(e.any(found.mask)),
-                self.restriction.every(*self._place(found), found.mask, self.waiting) as section,
+                self.restriction.every(*self._place(found), found.mask, self.done) as section,
             ):
                 self.take(rays, self._piece(found, section))
-        self.finish(rays)
 
     def _next_cells(self) -> Found:
         """To the next cell of every ray that may hold the level; of splines on tetrahedra, that does near its way."""
@@ -318,79 +332,207 @@ class _Program:
         return self.places.multiply(s, self.walk.scale.value)
 
 
-class _First(_Program):
-    """Every ray waits at its first hit, and all of a pack are searched together."""
+@dataclass(frozen=True)
+class Signs:
+    """Pieces that hold the level, made positive where they begin, and what their signs tell.
+
+    Attributes:
+        rows: coefficients; an end that is 0 is the smallest number, so that the level is met there for no sign.
+        begins, ends: masks: where the level is met where the piece begins, or ends.
+        simple: a mask of those that meet it once, and not at their ends.
+        hard: a mask of all others.
+    """
+
+    rows: Rows
+    begins: Value
+    ends: Value
+    simple: Value
+    hard: Value
+
+
+class _Located(_Program):
+    """Rays keep the part of a piece that has their root, and those of a pack are searched together."""
 
     def prepare(self) -> None:
         e, p = self.lanes, self.places
-        self._part = Part.of(e, self.variant.degree)
+        self.search = self.search_of(self.variant.degree)
+        self.part = Part.of(e, self.variant.degree)
         self._near, self._far = p.variable(p.constant(0)), p.variable(p.constant(0))
-        self._hit, self._at_start, self._at_end = (e.variable(self.walk.mask(False)) for _ in range(3))
+        self.hit, self._at_start, self._at_end = (e.variable(self.walk.mask(False)) for _ in range(3))
+
+    def search_of(self, degree: int) -> FirstRoot:
+        """Of roots in a piece."""
+        return FirstRoot(self.lanes, degree)
 
     def begin(self) -> None:
-        self._hit.value = self._at_start.value = self._at_end.value = self.walk.mask(False)
+        self.hit.value = self._at_start.value = self._at_end.value = self.walk.mask(False)
 
     def waiting(self) -> Value:
-        return self._hit.value
+        return self.hit.value
 
     def take(self, rays: Sequence[Value], piece: Piece) -> None:
         e, b = self.lanes, self.builder
         jump = self.jumps(piece)
-        holds = self.holds(piece, jump)
+        holds = b.and_(self.holds(piece, jump), b.not_(self.done()))
         with b.if_then(e.any(holds)):
-            self._keep(piece, holds, jump)
+            self.roots(rays, piece, self._signs(piece, holds, jump))
 
-    def _keep(self, piece: Piece, holds: Value, jump: Value) -> None:
-        """Keep a piece for the root search, if it has a root."""
-        e, b, search = self.lanes, self.builder, self.search
+    def roots(self, rays: Sequence[Value], piece: Piece, signs: Signs) -> None:
+        """Note parts of pieces that have a root."""
+        raise NotImplementedError
+
+    def _signs(self, piece: Piece, holds: Value, jump: Value) -> Signs:
+        e, b = self.lanes, self.builder
         zero, begin = e.constant(0), piece.rows[0]
         turn = e.where(b.fcmp_ordered("<", begin, zero), e.constant(-1), e.constant(1))
         *rows, end = (e.multiply(turn, r) for r in piece.rows)
         on_end = b.fcmp_ordered("==", end, zero)  # a root for the case that there is no earlier one
         rows.append(e.where(on_end, e.constant(2.0**-126 if e.bits == 32 else 2.0**-1022), end))
-        at_start = b.and_(holds, b.or_(jump, b.fcmp_ordered("==", begin, zero)))
-        inner = b.and_(holds, b.not_(at_start))
+        begins = b.and_(holds, b.or_(jump, b.fcmp_ordered("==", begin, zero)))
+        inner = b.and_(holds, b.not_(begins))
         simple = b.and_(inner, b.and_(self._changes_once(rows), b.fcmp_ordered("<", rows[-1], zero)))
-        self._part.assign(e, simple, rows, zero, e.constant(1))
-        found, hard = e.variable(b.or_(at_start, simple)), b.and_(inner, b.not_(simple))
-
-        def keep(mask: Value, rows: Rows, a: Value, h: Value) -> None:
-            self._part.assign(e, mask, rows, a, h)
-            found.value = b.or_(found.value, mask)
-
-        with b.if_then(e.any(hard), likely=False):
-            search.first_part(hard, rows, keep)
-        at_end = b.and_(b.and_(hard, on_end), b.not_(found.value))
-        self._note(piece, b.or_(found.value, at_end), at_start, at_end)
+        return Signs(rows, begins, on_end, simple, b.and_(holds, b.not_(simple)))
 
     def _changes_once(self, rows: Rows) -> Value:
         changes = self.search.changes(self.search.negative(self.search.lowered(rows)))
         return self.builder.icmp_unsigned("==", changes, ir.Constant(changes.type, [1] * self.lanes.count))
 
-    def _note(self, piece: Piece, hit: Value, at_start: Value, at_end: Value) -> None:
+    def note(self, piece: Piece, hit: Value, at_start: Value, at_end: Value) -> None:
         """That rays have hit, and where their pieces are."""
         b, p = self.builder, self.places
-        for kept, mask in ((self._hit, hit), (self._at_start, at_start), (self._at_end, at_end)):
+        for kept, mask in ((self.hit, hit), (self._at_start, at_start), (self._at_end, at_end)):
             kept.value = b.or_(kept.value, mask)
         self._near.value = p.where(hit, piece.found.near, self._near.value)
         self._far.value = p.where(hit, piece.found.far, self._far.value)
 
-    def finish(self, rays: Sequence[Value]) -> None:
+    def located(self) -> Value:
+        """t of the hits that were noted, doubles."""
         e, b, p = self.lanes, self.builder, self.places
-        hit, at_start, at_end = self._hit.value, self._at_start.value, self._at_end.value
+        at_start, at_end = self._at_start.value, self._at_end.value
         t = e.variable(e.constant(0))
-        inner = b.and_(hit, b.not_(b.or_(at_start, at_end)))
+        inner = b.and_(self.hit.value, b.not_(b.or_(at_start, at_end)))
         with b.if_then(e.any(inner)):
-            within = self.search.root([r.value for r in self._part.rows], inner)
-            t.value = e.multiply_add(within, self._part.h.value, self._part.a.value)
+            within = self.search.root([r.value for r in self.part.rows], inner)
+            t.value = e.multiply_add(within, self.part.h.value, self.part.a.value)
         own = e.where(at_start, e.constant(0), e.where(at_end, e.constant(1), t.value))
         own = own if self.number == DOUBLE else b.fpext(own, p.pack)
         near, far = self._near.value, self._far.value
         s = p.multiply_add(p.subtract(far, near), own, near)
-        found = p.where(
-            hit, self.length(p.add(self.walk.start.value, p.minimum(p.maximum(s, near), far))), p.constant(float("inf"))
-        )
+        return self.length(p.add(self.walk.start.value, p.minimum(p.maximum(s, near), far)))
+
+
+class _First(_Located):
+    """Every ray waits at its first hit."""
+
+    def roots(self, rays: Sequence[Value], piece: Piece, signs: Signs) -> None:
+        e, b = self.lanes, self.builder
+        self.part.assign(e, signs.simple, signs.rows, e.constant(0), e.constant(1))
+        found, hard = e.variable(b.or_(signs.begins, signs.simple)), b.and_(signs.hard, b.not_(signs.begins))
+
+        def keep(mask: Value, rows: Rows, a: Value, h: Value) -> None:
+            self.part.assign(e, mask, rows, a, h)
+            found.value = b.or_(found.value, mask)
+
+        with b.if_then(e.any(hard), likely=False):
+            self.search.first_part(hard, signs.rows, keep)
+        at_end = b.and_(b.and_(hard, signs.ends), b.not_(found.value))
+        self.note(piece, b.or_(found.value, at_end), signs.begins, at_end)
+
+    def finish(self, rays: Sequence[Value]) -> None:
+        p = self.places
+        found = p.where(self.hit.value, self.located(), p.constant(float("inf")))
         self.store(found, self.job.t, DOUBLE, rays)
+
+
+class _Sheets(_Located):
+    """Every ray keeps one root until it comes to the next; hits that rounding alone has apart are one."""
+
+    search: NextRoots
+
+    def prepare(self) -> None:
+        super().prepare()
+        e, p = self.lanes, self.places
+        self._none = ir.Constant(ir.VectorType(I64, e.count), [0] * e.count)
+        self._one = ir.Constant(self._none.type, [1] * e.count)
+        self._count, self._left = e.variable(self._none), e.variable(self.walk.mask(False))
+        self._last, self._extent = p.variable(p.constant(0)), p.variable(p.constant(0))
+        self._simple, self._begins = (e.variable(self.walk.mask(False)) for _ in range(2))
+
+    def search_of(self, degree: int) -> NextRoots:
+        return NextRoots(self.lanes, degree)
+
+    def begin(self) -> None:
+        super().begin()
+        self._count.value, self._last.value = self._none, self.places.constant(float("-inf"))
+
+    def waiting(self) -> Value:
+        return self._has(self.builder.select(self.hit.value, self._one, self._none))
+
+    def done(self) -> Value:
+        return self._has(self._none)
+
+    def _has(self, more: Value) -> Value:
+        """A mask of rays that have all sheets, with so many more."""
+        count = self.builder.add(self._count.value, more)
+        return self.builder.icmp_signed(">=", count, self.lanes.everywhere(self.job.most))
+
+    def along(self, rays: Sequence[Value], directions: Sequence[Value]) -> None:
+        e, b, p = self.lanes, self.builder, self.places
+        x, y, z = (p.absolute(d) for d in directions)
+        self._extent.value = p.divide(p.everywhere(self.job.extent), p.maximum(p.maximum(x, y), z))
+        with e.repeat_while(lambda: e.any(b.and_(self.walk.going.value, b.not_(self.done())))):
+            super().along(rays, directions)
+            self._write(rays)
+
+    def roots(self, rays: Sequence[Value], piece: Piece, signs: Signs) -> None:
+        e, b, zero, none = self.lanes, self.builder, self.lanes.constant(0), self.walk.mask(False)
+        at_zero = b.fcmp_ordered("==", piece.rows[0], zero)
+        again = b.and_(b.and_(piece.joined, at_zero), b.fcmp_ordered("==", piece.before, zero))
+        ends = b.and_(signs.ends, self._some(piece.rows))  # else it is met where the piece begins, and stays there
+        self._simple.value, self._begins.value = signs.simple, b.and_(signs.begins, b.not_(again))
+        self._left.value = b.or_(signs.simple, signs.hard)
+        with b.if_then(e.any(signs.hard), likely=False):
+            self.search.begin(signs.hard, signs.rows, e.where(at_zero, zero, e.constant(1)))
+        with e.repeat_while(lambda: e.any(self._left.value)):
+            with b.if_then(e.any(b.and_(self.hit.value, self._left.value))):
+                self._write(rays)
+                self._left.value = b.and_(self._left.value, b.not_(self.done()))
+            left = self._left.value
+            simple, begins = b.and_(left, self._simple.value), b.and_(left, self._begins.value)
+            self.part.assign(e, simple, signs.rows, zero, e.constant(1))
+            self.note(piece, b.or_(simple, begins), begins, none)
+            self._simple.value = self._begins.value = none
+            self._left.value = b.and_(left, b.not_(simple))
+            search = b.and_(self._left.value, b.not_(begins))
+            with b.if_then(e.any(search), likely=False):
+                found, over = self.search.next_part(search, lambda *part: self.part.assign(e, *part))
+                at_end = b.and_(b.and_(over, self.search.above()), b.and_(ends, b.not_(found)))
+                self.note(piece, b.or_(found, at_end), none, at_end)
+                self._left.value = b.and_(self._left.value, b.not_(over))
+
+    def _some(self, rows: Rows) -> Value:
+        """A mask of those that are not all 0."""
+        size = self.lanes.absolute(rows[0])
+        for row in rows[1:]:
+            size = self.lanes.maximum(size, self.lanes.absolute(row))
+        return self.builder.fcmp_ordered(">", size, self.lanes.constant(0))
+
+    def _write(self, rays: Sequence[Value]) -> None:
+        """Search the roots that are kept, and write them over those that are k before."""
+        e, b, p, j = self.lanes, self.builder, self.places, self.job
+        t, hit, count, last = self.located(), self.hit.value, self._count.value, self._last.value
+        apart = p.multiply(p.add(t, self._extent.value), p.constant(PLACES_APART * 2.0**-52))
+        new = b.and_(hit, b.fcmp_ordered(">", p.subtract(t, last), apart))
+        for lane, ray in enumerate(rays):
+            with b.if_then(e.lane(new, lane)):
+                place = b.add(b.mul(ray, j.sheets), b.urem(e.lane(count, lane), j.sheets))
+                b.store(e.lane(t, lane), e.advance(j.t, place, DOUBLE))
+        self._count.value = b.add(count, b.zext(new, count.type))
+        self._last.value = p.where(hit, t, last)
+        self.hit.value = self._at_start.value = self._at_end.value = self.walk.mask(False)
+
+    def finish(self, rays: Sequence[Value]) -> None:
+        self.store(self._count.value, self.job.count, I64, rays)
 
 
 class _Candidates(_Program):
@@ -437,3 +579,6 @@ class _Candidates(_Program):
 
     def finish(self, rays: Sequence[Value]) -> None:
         self.store(self._count.value, self.job.count, I64, rays)
+
+
+_PROGRAMS: dict[str, type[_Program]] = {"first": _First, "candidates": _Candidates, "sheets": _Sheets}

@@ -7,6 +7,7 @@ datum stands where. Only data that a coefficient needs are read for it, so that 
 from __future__ import annotations
 
 import ctypes
+import itertools
 from types import SimpleNamespace
 
 from llvmlite import ir
@@ -69,6 +70,18 @@ class Windows:
             with copied:
                 self._copy(x, y)
                 self.base.value, self.stride.value = self.buffer, I64(self.length)
+
+    def ask(self, x: Value, y: Value) -> None:
+        """Have the window of the cell (x, y) brought near; of one that is partly outside, whatever lies there."""
+        e, b, j, cell = self.lanes, self.builder, self.job, self.cell
+        left, top = (b.sub(b.mul(n, I64(cell.steps)), I64(cell.before)) for n in (x, y))
+        row = e.advance(j.values, b.add(b.mul(top, j.row), left), self.storage.raw)
+        used = sorted({number for mask in cell.masks for number, _ in mask})
+        for _, numbers in itertools.groupby(used, key=lambda number: number // cell.size):
+            columns = [number % cell.size for number in numbers]
+            for column in {columns[0], columns[-1]}:
+                e.ask(e.advance(row, I64(column), self.storage.raw))
+            row = e.advance(row, j.row, self.storage.raw)
 
     def _copy(self, x: Value, y: Value) -> None:
         """Data through the tables; of places beyond the last cell the last ones again."""

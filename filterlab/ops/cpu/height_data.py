@@ -89,15 +89,17 @@ class Data:
         """
         e, b, j = self.lanes, self.builder, self.job
         wide = lambda pack: b.sext(pack, ir.VectorType(I64, e.count))  # noqa: E731
-        x, y, down = map(wide, (*start, signs[1]))
+        up, forward = (b.icmp_signed(">", sign, e.integers_32(0)) for sign in signs[::-1])
+        row_step = wide(e.everywhere(b.trunc(j.row_step, I32)))  # of 32 bits: machines multiply packs of those at once
+        number = b.add(b.mul(wide(start[1]), row_step), wide(start[0]))
         size = e.everywhere(I64(self.storage.bytes))
-        stride = e.everywhere(b.mul(j.row_step, I64(self.storage.bytes)))
-        base = b.add(e.everywhere(b.ptrtoint(values, I64)), b.add(b.mul(y, stride), b.mul(x, size)))
-        step, forward = b.mul(down, stride), b.icmp_signed(">", signs[0], e.integers_32(0))
-        for number, row in enumerate(self.rows):
+        own = b.add(e.everywhere(b.ptrtoint(values, I64)), b.mul(number, size))
+        stride = b.mul(row_step, size)
+        step, at = b.select(up, stride, b.sub(e.everywhere(I64(0)), stride)), 0
+        for place, row in enumerate(self.rows):
             ends = (e.everywhere(I64(self.storage.bytes * n)) for n in (row.first, -row.last))
-            own = b.add(b.add(base, b.mul(step, e.everywhere(I64(row.step)))), b.select(forward, *ends))
-            e.store(own, self._address(index, number, I64(0)))
+            own, at = b.add(own, b.mul(step, e.everywhere(I64(row.step - at)))), row.step
+            e.store(b.add(own, b.select(forward, *ends)), self._address(index, place, I64(0)))
         b.store(I64(0), e.advance(self.copied, index, I64))
 
     def _address(self, index: Value, row: int, lane: Value) -> Value:

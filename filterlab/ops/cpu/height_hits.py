@@ -16,7 +16,7 @@ from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.height_hulls import HeightHullsJob, HeightHullsVariant
 from filterlab.ops.cpu.height_rays import LANES, PACKS_OF_A_CHUNK, HeightRaysJob, HeightRaysVariant
 from filterlab.ops.cpu.job import Job
-from filterlab.ops.cpu.memory import ARITHMETIC
+from filterlab.ops.cpu.memory import ARITHMETIC, fresh
 from filterlab.ops.gather import STORAGE, in_whole_rows
 from filterlab.ops.height_hits import DEGREE, Cell, HeightHits, Pyramid, data_of_windows, slack_of
 from filterlab.ops.heights import Heights
@@ -24,8 +24,8 @@ from filterlab.ops.raycast import Candidates, Written, written_in_parts
 
 
 def pyramid(heights: Heights, cell: Cell) -> Pyramid:
-    """`ops.reference.height_hits.pyramid`, fused."""
-    found = Pyramid.room(heights, cell.finest)
+    """`ops.reference.height_hits.pyramid`, fused; on huge pages, since rays read it here and there."""
+    found = Pyramid.room(heights, cell.finest, fresh)
     columns, rows = heights.cells
     blocks_y, blocks_x = found.sizes[0]
     job = HeightHullsJob(cells_x=columns, cells_y=rows, blocks_x=blocks_x, chunks=blocks_y)

@@ -20,7 +20,9 @@ from filterlab.ops.cpu.height_data import Data
 from filterlab.ops.cpu.lanes import DOUBLE, I32, I64, STORAGE, Lanes, Value
 from filterlab.ops.heights import Masks, Pattern, rows
 
-BLOCK = 2  # packs that are located before the first of them is summed
+_LINES_ASKED = 512  # of memory, at most, before the first of them is read
+_FEWEST_PACKS = 2  # that are located before the first of them is summed
+_BEYOND = 2.0**31 - 256  # columns or rows, of points: further than any grid has
 
 # Strides are in numbers.
 FIELDS: dict[str, type] = {
@@ -94,6 +96,12 @@ class _Located:
     signs: list[Value]
 
 
+def _packs_at_once(variant: HeightsVariant) -> int:
+    """How many packs are located before the first of them is summed: many where points are never sorted."""
+    rows_of_data = len({b for _, b in variant.pattern.offsets})
+    return _LINES_ASKED // (rows_of_data * variant.lanes) if variant.pattern.degree == 1 else _FEWEST_PACKS
+
+
 class _Program:
     def __init__(self, variant: HeightsVariant, function: ir.Function) -> None:
         self.variant = variant
@@ -102,12 +110,12 @@ class _Program:
         self.wide = Lanes(self.builder, "float64", variant.lanes)
         self.storage, self.rows = STORAGE[variant.storage], rows(variant.order)
         self.job = frame.load_job(self.lanes, function.args[0], FIELDS)
-        self.masks = Masks(self.lanes, variant.pattern)
-        self.data = Data(self.lanes, self.job, variant.pattern, self.storage, variant.zeros, BLOCK)
-        self.local = self.lanes.reserve(self.lanes.number, 2 * BLOCK * variant.lanes)
-        self.down = self.lanes.reserve(I32, BLOCK * variant.lanes)
-        steps = (getattr(self.job, f"step_{axis}") for axis in "xy")
-        self.per_step = [self.wide.everywhere(self.wide.divide(DOUBLE(1), step)) for step in steps]
+        self.masks, self.packs = Masks(self.lanes, variant.pattern), _packs_at_once(variant)
+        self.data = Data(self.lanes, self.job, variant.pattern, self.storage, variant.zeros, self.packs)
+        self.local = self.lanes.reserve(self.lanes.number, 2 * self.packs * variant.lanes)
+        self.down = self.lanes.reserve(I32, self.packs * variant.lanes)
+        per_step = (self.wide.divide(DOUBLE(1), getattr(self.job, f"step_{axis}")) for axis in "xy")
+        self.per_step = [self.lanes.convert(self.wide.everywhere(own), STORAGE["float64"]) for own in per_step]
 
     def write(self) -> None:
         e, b, j = self.lanes, self.builder, self.job
@@ -119,8 +127,8 @@ class _Program:
             own_rows = e.advance(j.rows, e.product(entry, I64(len(self.rows)), j.count), e.number)
             values = e.advance(j.values, b.mul(entry, j.values_entry), self.storage.raw)
             last = e.smaller(b.add(first, j.chunk), packs)
-            with e.repeat(first, last, BLOCK) as block:
-                end = e.smaller(b.add(block, I64(BLOCK)), last)
+            with e.repeat(first, last, self.packs) as block:
+                end = e.smaller(b.add(block, I64(self.packs)), last)
                 with e.repeat(block, end) as pack:
                     self._find(b.mul(pack, I64(e.count)), b.sub(pack, block), points, values)
                 with e.repeat(block, end) as pack:
@@ -132,12 +140,13 @@ class _Program:
         e, b, j = self.lanes, self.builder, self.job
         xy = self._points(e.advance(points, b.mul(first, I64(2)), e.number), b.sub(j.count, first))
         places, cells = zip(*map(self._axis, xy, "xy"), strict=True)
-        at = self._located(places, list(map(self._first, cells, "xy")))
+        firsts = list(map(self._first, cells))
+        at = self._located(places, firsts)
         for n, own in enumerate(at.local):
             e.store(own, self._kept(self.local, 2, index, n, e.number))
         e.store(at.signs[1], self._kept(self.down, 1, index, 0, I32))
         self.data.find(values, index, at.start, at.signs)
-        within = e.both(*map(self._within, cells, "xy"))
+        within = e.both(*map(self._within, firsts, "xy"))
         with b.if_then(b.not_(e.all(within)), likely=False):
             start = self._located(places, list(map(self._folded, cells, "xy"))).start
             self.data.copy(values, index, b.not_(within), [*start, *at.signs], self.variant.operation == "splat")
@@ -191,27 +200,26 @@ class _Program:
         return local, w.multiply(cell, w.constant(self.variant.pattern.steps))
 
     def _within(self, first: Value, axis: str) -> Value:
-        """A mask: whether all data that a cell may need are in the grid; false for NaN."""
-        w, b, pattern = self.wide, self.builder, self.variant.pattern
-        size = w.everywhere(b.sitofp(getattr(self.job, f"size_{axis}"), DOUBLE))
-        after = w.add(first, w.constant(pattern.steps + pattern.reach))
-        return w.both(b.fcmp_ordered(">=", first, w.constant(pattern.reach)), b.fcmp_ordered("<", after, size))
+        """A mask: whether all data that a cell may need are in the grid."""
+        e, b, pattern = self.lanes, self.builder, self.variant.pattern
+        most = b.sub(b.trunc(getattr(self.job, f"size_{axis}"), I32), I32(pattern.steps + pattern.reach))
+        after = b.icmp_signed(">=", first, e.integers_32(pattern.reach))
+        return e.both(after, b.icmp_signed("<", first, e.everywhere(most)))
 
-    def _first(self, first: Value, axis: str) -> Value:
-        """In 32 bits."""
+    def _first(self, first: Value) -> Value:
+        """In 32 bits, far beyond the grid where it is not in it."""
         w = self.wide
-        low, high = (w.everywhere(getattr(self.job, f"{name}_{axis}")) for name in ("low", "high"))
-        return w.to_integer(w.clamp(first, low, high))
+        return w.to_integer(w.clamp(first, w.constant(-_BEYOND), w.constant(_BEYOND)))
 
     def _folded(self, first: Value, axis: str) -> Value:
         """As the tables have it, in 32 bits."""
         w = self.wide
+        low, high = (w.everywhere(getattr(self.job, f"{name}_{axis}")) for name in ("low", "high"))
         if self.variant.periodic:
-            low, high = (w.everywhere(getattr(self.job, f"{name}_{axis}")) for name in ("low", "high"))
             first = w.subtract(first, w.multiply(w.floor(w.divide(first, high)), high))
             first = w.where(w.less(first, low), w.add(first, high), first)
             first = w.where(w.less(first, high), first, w.subtract(first, high))
-        return self._first(first, axis)
+        return w.to_integer(w.clamp(first, low, high))
 
     def _located(self, places: Sequence[Value], firsts: Sequence[Value]) -> _Located:
         e, b, m = self.lanes, self.builder, self.variant.pattern.steps
@@ -232,10 +240,9 @@ class _Program:
 
     def _factors(self, down: Value) -> list[Value]:
         """By what derivatives along λ1 and λ2 are those along x and y, row by row."""
-        e, w = self.lanes, self.wide
-        signs = (self.builder.neg(down) if self.variant.pattern.mirrored else down), down
-        products = (w.multiply(w.of_integer(sign), own) for sign, own in zip(signs, self.per_step, strict=True))
-        along = [e.convert(own, STORAGE["float64"]) for own in products]
+        e = self.lanes
+        forward, up = self._forward(down), self.builder.icmp_signed(">", down, e.integers_32(0))
+        along = [e.where(to, own, e.negate(own)) for to, own in zip((forward, up), self.per_step, strict=True)]
         return [self._power(along, i, j) for i, j in self.rows]
 
     def _power(self, along: Sequence[Value], i: int, j: int) -> Value:

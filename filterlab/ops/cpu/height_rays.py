@@ -2,7 +2,9 @@
 
 For P rays in turn, as `ops.height_hits` says:
 
-    walk        from block to block, up and down the pyramid, in integers: no rounding can lose a ray or stop it
+    walk        from block to block, up and down the pyramid, in integers: no rounding can lose a ray or stop it. Some
+                rays come to the first cell that they may hit something in before the first of them goes on: of a large
+                grid the data of all are then on their way from memory. Bounds are asked for on the way down
     restrict    in a cell the quartics of both triangles at once: lanes are (upper p, upper q, lower p, lower q), where
                 a step of de Casteljau's algorithm to p is one to q, or to the other of both, in every lane
     signs       no change of sign: on. One: there is the hit, the ray waits for the others
@@ -15,8 +17,9 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 
 from llvmlite import ir
@@ -24,7 +27,7 @@ from llvmlite import ir
 from filterlab import bernstein
 from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.height_cells import GRID, LOWER, UPPER, Windows
-from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, FLOAT, I1, I8, I64, STORAGE, Lanes, Value
+from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, FLOAT, I1, I8, I64, STORAGE, Lanes, Value, Variable
 from filterlab.ops.cpu.polynomials import FirstRoot, Rows
 from filterlab.ops.height_hits import DEGREE, POINTS, Cell
 from filterlab.ops.pieces import NO_MOTION
@@ -32,7 +35,9 @@ from filterlab.ops.raycast import REPEATED
 
 LANES = 4
 PACKS_OF_A_CHUNK = 16
+AHEAD = 16  # rays that come to their first cells before the first of them is restricted to one
 _N = DEGREE + 1
+_LEVELS_AHEAD = 2  # at which bounds are asked for where a line goes down
 _NOTHING, _INNER, _AT_START, _AT_END = range(4)
 
 # Arrays are contiguous; R rays, d a double.
@@ -128,7 +133,9 @@ class _Program:
         self.cell_at = [e.variable(I64(0)) for _ in range(2)]
         self.level, self.going = e.variable(I64(0)), e.variable(I1(0))
         self.s, self.ended_at, self.ended_with = (e.variable(DOUBLE(0.0)) for _ in range(3))
-        self.relevant, self.on = e.variable(I1(0)), e.variable(I1(0))
+        self.relevant, self.on, self.arrived = (e.variable(I1(0)) for _ in range(3))
+        self.first_cells, self.first_s = e.reserve(I64, 2 * AHEAD), e.reserve(DOUBLE, AHEAD)
+        self.arrivals = e.reserve(I1, AHEAD)
 
     def write(self) -> None:
         e, b, j = self.lanes, self.builder, self.job
@@ -136,11 +143,15 @@ class _Program:
         with frame.every_chunk(e, j) as chunk:
             begin = b.mul(chunk, I64(LANES * PACKS_OF_A_CHUNK))
             end = e.smaller(b.add(begin, I64(LANES * PACKS_OF_A_CHUNK)), j.rays)
-            with e.repeat(begin, end, LANES) as first:
-                self.begin()
-                with e.repeat(first, e.smaller(b.add(first, I64(LANES)), end)) as number:
-                    self._walk(self._line(number), b.sub(number, first))
-                self.finish(first)
+            with e.repeat(begin, end, AHEAD) as ahead:
+                last = e.smaller(b.add(ahead, I64(AHEAD)), end)
+                with e.repeat(ahead, last) as number:
+                    self._approach(self._line(number), b.sub(number, ahead))
+                with e.repeat(ahead, last, LANES) as first:
+                    self.begin()
+                    with e.repeat(first, e.smaller(b.add(first, I64(LANES)), last)) as number:
+                        self._walk(number, b.sub(number, first), b.sub(number, ahead))
+                    self.finish(first)
         b.ret_void()
 
     def prepare(self) -> None:
@@ -204,14 +215,43 @@ class _Program:
         """|a| of one double."""
         return self.lanes.maximum(a, self.builder.fneg(a))
 
-    def _walk(self, line: _Line, lane: Value) -> None:
+    def _approach(self, line: _Line, place: Value) -> None:
+        """Down to the first cell in which a line may meet something; the data of that are asked for."""
         e, b, j = self.lanes, self.builder, self.job
-        for own, place, count in zip(self.cell_at, line.origin[:2], (j.cells_x, j.cells_y), strict=True):
-            own.value = self._cell_of(place, I64(0), b.sub(count, I64(1)))
-        self.level.value, self.going.value = j.top, line.meets
-        self.s.value, self.ended_at.value, self.ended_with.value = DOUBLE(0.0), DOUBLE(-1.0), DOUBLE(0.0)
+        for own, x, count in zip(self.cell_at, line.origin[:2], (j.cells_x, j.cells_y), strict=True):
+            own.value = self._cell_of(x, I64(0), b.sub(count, I64(1)))
+        self.level.value, self.s.value = j.top, DOUBLE(0.0)
+        self.going.value, self.arrived.value = line.meets, I1(0)
         with e.repeat_while(lambda: self.going.value):
-            self._step(line, lane)
+            self._step(line, self._arrive)
+        for address, value in zip(self._kept(place), self._found(), strict=True):
+            b.store(value.value, address)
+
+    def _arrive(self, cell: Sequence[Value], s: Value, out: Value) -> None:
+        self.going.value, self.arrived.value = I1(0), I1(1)
+        self.windows.ask(*cell)
+
+    def _found(self) -> list[Variable]:
+        """What `_approach` finds."""
+        return [*self.cell_at, self.s, self.arrived]
+
+    def _kept(self, place: Value) -> list[Value]:
+        """Where that is kept."""
+        e, b = self.lanes, self.builder
+        cells = (e.advance(self.first_cells, b.add(b.shl(place, I64(1)), I64(axis)), I64) for axis in range(2))
+        return [*cells, e.advance(self.first_s, place, DOUBLE), e.advance(self.arrivals, place, I1)]
+
+    def _walk(self, number: Value, lane: Value, place: Value) -> None:
+        """From the first cell on."""
+        e, b = self.lanes, self.builder
+        for address, variable, kind in zip(self._kept(place), self._found(), (I64, I64, DOUBLE, I1), strict=True):
+            variable.value = b.load(address, typ=kind)
+        with b.if_then(self.arrived.value):
+            line = self._line(number)
+            self.level.value, self.going.value = I64(0), I1(1)
+            self.ended_at.value, self.ended_with.value = DOUBLE(-1.0), DOUBLE(0.0)
+            with e.repeat_while(lambda: self.going.value):
+                self._step(line, partial(self._in_cell, line, lane))
 
     def _cell_of(self, place: Value, low: Value, high: Value) -> Value:
         """⌊place⌋ within [low, high]."""
@@ -223,7 +263,7 @@ class _Program:
     def _larger(self, a: Value, c: Value) -> Value:
         return self.builder.select(self.builder.icmp_signed(">", a, c), a, c)
 
-    def _step(self, line: _Line, lane: Value) -> None:
+    def _step(self, line: _Line, in_cell: Callable[[Sequence[Value], Value, Value], None]) -> None:
         e, b = self.lanes, self.builder
         level, s = self.level.value, self.s.value
         cell = [own.value for own in self.cell_at]
@@ -235,8 +275,9 @@ class _Program:
         with b.if_then(self.relevant.value), b.if_else(b.icmp_signed(">", level, I64(0))) as (down, here):
             with down:
                 self.level.value, self.on.value = b.sub(level, I64(1)), I1(0)
+                self._ask_for_bounds(cell, self._larger(b.sub(level, I64(_LEVELS_AHEAD)), I64(self.cell.finest)))
             with here:
-                self._in_cell(line, lane, cell, s, out)
+                in_cell(cell, s, out)
         with b.if_then(b.and_(self.on.value, self.going.value)):
             self._advance(line, cell, level, ways, out)
 
@@ -250,15 +291,23 @@ class _Program:
 
     def _meets(self, line: _Line, cell: Sequence[Value], level: Value, s: Value, out: Value) -> Value:
         """Whether the line may meet something in its block."""
-        e, b, j = self.lanes, self.builder, self.job
-        own = b.sub(level, I64(self.cell.finest))
-        start, width = (b.load(e.advance(array, own, I64), typ=I64) for array in (j.starts, j.widths))
-        x, y = (b.ashr(n, level) for n in cell)
-        block = e.advance(j.bounds, b.shl(b.add(start, b.add(b.mul(y, width), x)), I64(1)), FLOAT)
+        e, b = self.lanes, self.builder
+        block = self._bounds(cell, level)
         low, high = (b.fpext(b.load(e.advance(block, I64(k), FLOAT), typ=FLOAT), DOUBLE) for k in range(2))
         first, last = (line.at(e, 2, at) for at in (s, out))
         below = b.fcmp_ordered("<=", e.minimum(first, last), high)
         return b.and_(below, b.fcmp_ordered(">=", e.maximum(first, last), low))
+
+    def _bounds(self, cell: Sequence[Value], level: Value) -> Value:
+        """Where those of a cell's block are."""
+        e, b, j = self.lanes, self.builder, self.job
+        own = b.sub(level, I64(self.cell.finest))
+        start, width = (b.load(e.advance(array, own, I64), typ=I64) for array in (j.starts, j.widths))
+        x, y = (b.ashr(n, level) for n in cell)
+        return e.advance(j.bounds, b.shl(b.add(start, b.add(b.mul(y, width), x)), I64(1)), FLOAT)
+
+    def _ask_for_bounds(self, cell: Sequence[Value], level: Value) -> None:
+        self.lanes.ask(self._bounds(cell, level))
 
     def _advance(self, line: _Line, cell: Sequence[Value], level: Value, ways: Sequence[Value], out: Value) -> None:
         """To the beginning of the next block."""
@@ -491,10 +540,10 @@ class _Candidates(_Program):
     def prepare(self) -> None:
         self.count = self.lanes.variable(I64(0))
 
-    def _walk(self, line: _Line, lane: Value) -> None:
+    def _walk(self, number: Value, lane: Value, place: Value) -> None:
         self.count.value = I64(0)
-        super()._walk(line, lane)
-        self.builder.store(self.count.value, self.lanes.advance(self.job.count, line.number, I64))
+        super()._walk(number, lane, place)
+        self.builder.store(self.count.value, self.lanes.advance(self.job.count, number, I64))
 
     def take(self, line: _Line, lane: Value, rows: Rows, near: Value, far: Value, repeated: Value) -> None:
         e, b, j = self.lanes, self.builder, self.job

@@ -4,8 +4,8 @@ Same meaning as `ops.reference.heights`. Heights are read as they are stored, su
 of jet does not depend on the number of threads, bit by bit; that of splat only on their number. Memory beyond the
 results: 8 bytes for every row and column of the heights; of splat a copy of the result for every further thread.
 
-Points that lie all over a large grid wait for memory. Their data are asked for a pack ahead; where a patch needs many
-(`c1`, `c2` prefiltered), many points are sorted by tiles first (`ops.cpu.order`), in copies of a part of them.
+Points that lie all over a large grid wait for memory. Their data are asked for ahead; where a patch has more than 3,
+many points are sorted by tiles first (`ops.cpu.order`), in copies of a part of them.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ from filterlab.ops.heights import Heights, Places, rows
 from filterlab.volume import Boundary
 
 _POINTS_PER_THREAD = 2048  # fewer are not worth waking a thread for
-_EDGE = 32  # data of a tile by which points are sorted
-_MANY_DATA = 10  # of a patch
+_TILE = (256, 4)  # columns, rows by which points are sorted: rows of a grid may be apart by what caches keep together
 _SMALLEST_SORTED_IN = 2 << 20  # bytes of a grid
 _NEAR = 16  # data: points that are farther from the one before are scattered
 _FEWEST_SCATTERED = 4096  # points of a grid
@@ -42,19 +41,20 @@ def jet(heights: Heights, points: Tensor, order: int) -> Tensor:
     if not out.numel():
         return out
     values, points = _in_lines(heights.values), readable(points, 1)
-    if not _sorting_pays(heights, values, points):
-        _jet(heights, values, points, out, order)
+    asked = _scattered(heights, values, points)
+    if not (asked and _sorting_pays(heights, values, points)):
+        _jet(heights, values, points, out, order, asked)
         return out
     for entry, part, ordered in in_order(points, _tiles(heights)):
         own = fresh((1, out.shape[1], ordered.count), points.dtype)
-        _jet(heights, values[entry : entry + 1], ordered.points[None], own, order)
+        _jet(heights, values[entry : entry + 1], ordered.points[None], own, order, False)
         ordered.restore(own[0], out[entry, :, part])
     return out
 
 
-def _jet(heights: Heights, values: Tensor, points: Tensor, out: Tensor, order: int) -> None:
+def _jet(heights: Heights, values: Tensor, points: Tensor, out: Tensor, order: int, asked: bool) -> None:
     threads = threads_for(points.shape[0] * points.shape[1], _POINTS_PER_THREAD)
-    job, run = _described("jet", heights, values, points, out, order, threads * CHUNKS_PER_THREAD)
+    job, run = _described("jet", heights, values, points, out, order, asked, threads * CHUNKS_PER_THREAD)
     pool.run(run, [job] * threads)
 
 
@@ -73,21 +73,24 @@ def splat(heights: Heights, points: Tensor, cotangents: Tensor, order: int) -> T
     parts = max(1, min(parts, 8 * n * m // size))
     every = [out, *(zeros(shape, out.dtype) for _ in range(parts - 1))]
     points, cotangents = readable(points, 1), readable(cotangents.to(points.dtype), 0)
-    if not _sorting_pays(heights, out, points):
-        _splat(heights, every, points, cotangents, order)
+    asked = _scattered(heights, out, points)
+    if not (asked and _sorting_pays(heights, out, points)):
+        _splat(heights, every, points, cotangents, order, asked)
     else:
         for entry, part, ordered in in_order(points, _tiles(heights)):
             own = fresh((1, cotangents.shape[1], ordered.count), points.dtype)
             ordered.arrange(cotangents[entry, :, part], own[0])
-            _splat(heights, [grid[entry : entry + 1] for grid in every], ordered.points[None], own, order)
+            _splat(heights, [grid[entry : entry + 1] for grid in every], ordered.points[None], own, order, False)
     for other in every[1:]:
         out += other
     return out.contiguous()
 
 
-def _splat(heights: Heights, grids: Sequence[Tensor], points: Tensor, cotangents: Tensor, order: int) -> None:
+def _splat(
+    heights: Heights, grids: Sequence[Tensor], points: Tensor, cotangents: Tensor, order: int, asked: bool
+) -> None:
     """An equal share of the points to every grid."""
-    job, run = _described("splat", heights, grids[0], points, cotangents, order, len(grids))
+    job, run = _described("splat", heights, grids[0], points, cotangents, order, asked, len(grids))
     pool.run(run, [_share(job, own, part, len(grids)) for part, own in enumerate(grids)])
 
 
@@ -99,13 +102,22 @@ def _share(job: HeightsJob, values: Tensor, part: int, parts: int) -> HeightsJob
 
 
 def _in_lines(values: Tensor) -> Tensor:
-    """(N, H, W) whose rows lie together."""
+    """(N, H, W) whose rows lie together, less than 2³¹ numbers apart."""
     values = values.detach().resolve_neg()
-    return values if values.stride(-1) == 1 and values.stride(-2) >= 0 else values.contiguous()
+    return values if values.stride(-1) == 1 and 0 <= values.stride(-2) < 1 << 31 else values.contiguous()
 
 
-def _described(operation: str, heights: Heights, values: Tensor, points: Tensor, rows_: Tensor, order: int, parts: int):
-    """The job of all points, in at least so many chunks, and its program."""
+def _described(
+    operation: str,
+    heights: Heights,
+    values: Tensor,
+    points: Tensor,
+    rows_: Tensor,
+    order: int,
+    asked: bool,
+    parts: int,
+):
+    """The job of all points, in at least so many chunks, and its program; asked: whether memory is, for data ahead."""
     entries, count = points.shape[:2]
     pattern, boundary = heights.pattern, heights.boundary
     lanes = lanes_of(points.dtype)
@@ -113,7 +125,7 @@ def _described(operation: str, heights: Heights, values: Tensor, points: Tensor,
     chunk = max(1, min(-(-packs // max(1, parts // entries)), MOST_POINTS // lanes))
     job = HeightsJob(next=0, count=count, entries=entries, chunk=chunk, chunks=entries * -(-packs // chunk))
     job.values_entry, job.points_entry, job.row_step = values.stride(0), points.stride(0), values.stride(-2)
-    job.asked = _scattered(heights, values, points)
+    job.asked = asked
     job.point(values=values, points=points, rows=rows_)
     for axis, name in enumerate(("column", "line")):
         n, letter = values.shape[-1 - axis], "xy"[axis]
@@ -136,11 +148,9 @@ def _scattered(heights: Heights, values: Tensor, points: Tensor) -> bool:
 
 
 def _sorting_pays(heights: Heights, values: Tensor, points: Tensor) -> bool:
-    """Whether sorting scattered points costs less than it saves: where a patch needs many data, of which others have
-    most."""
-    if len(heights.pattern.offsets) < _MANY_DATA or points.shape[1] < FEWEST_SORTED:
-        return False
-    return _bytes_of(values) >= _SMALLEST_SORTED_IN and _scattered(heights, values, points)
+    """Whether sorting scattered points costs less than it saves: not for planes, whose data are asked for in time."""
+    enough = points.shape[1] >= FEWEST_SORTED and _bytes_of(values) >= _SMALLEST_SORTED_IN
+    return enough and heights.pattern.degree > 1
 
 
 def _bytes_of(values: Tensor) -> int:
@@ -148,4 +158,4 @@ def _bytes_of(values: Tensor) -> int:
 
 
 def _tiles(heights: Heights) -> Bricks:
-    return Bricks.of(heights.values.shape[:-3:-1], heights.origin, heights.spacing, _EDGE)
+    return Bricks.of(heights.values.shape[:-3:-1], heights.origin, heights.spacing, _TILE)

@@ -347,8 +347,11 @@ class Lanes:
 
     def first_lanes(self, count: Value) -> Value:
         """True in as many lanes as the integer says, at most P: a mask for the end of a row."""
-        lanes = ir.Constant(ir.VectorType(I64, self.count), list(range(self.count)))
-        return self.builder.icmp_signed("<", lanes, self.everywhere(count))
+        b, kind = self.builder, ir.IntType(self.bits)  # as wide as what is masked
+        count = b.select(b.icmp_signed(">", count, I64(0)), self.smaller(count, I64(self.count)), I64(0))
+        count = count if self.bits == 64 else b.trunc(count, kind)
+        lanes = ir.Constant(ir.VectorType(kind, self.count), list(range(self.count)))
+        return b.icmp_signed("<", lanes, self.everywhere(count))
 
     def convert(self, raw: Value, storage: Storage) -> Value:
         """A pack as it lay in memory, as a pack of this arithmetic."""

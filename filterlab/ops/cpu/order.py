@@ -39,15 +39,15 @@ from filterlab.ops.cpu.sorting import AXES, SortingJob, SortingVariant
 POINTS_AT_ONCE = 1 << 22  # points that are sorted together, for which copies of points and rows are held
 _EDGE = 8  # of a brick
 _MOST_BRICKS = 1 << 16
-_LOOKED_AT = 2048
+_LOOKED_AT = 512
 
 
 def scattered(points: Tensor, edge: Tensor | float = _EDGE) -> bool:
     """Whether most points (N, M, axes) lie more than a brick from the one before: looked at in a few places."""
-    count = points.shape[1]
-    at = torch.linspace(0, count - 2, min(_LOOKED_AT, count - 1), dtype=torch.float64).long()
-    far = ((points[:, at + 1] - points[:, at]).abs() > edge).any(-1)
-    return bool(far.double().mean() > 0.5)
+    step = points.shape[1] // _LOOKED_AT | 1
+    before, after = points[:, :-1:step], points[:, 1::step]
+    far = ((after - before).abs_() > edge).any(-1)
+    return 2 * int(far.sum()) > far.numel()
 
 
 @dataclass(frozen=True)
@@ -65,17 +65,20 @@ class Bricks:
     count: tuple[int, ...]
 
     @classmethod
-    def of(cls, sizes: Sequence[int], start: Sequence[float], step: Sequence[float], edge: int = _EDGE) -> Bricks:
-        """Of so many coefficients, `edge` of them in a brick along every axis, more where there were too many bricks.
+    def of(
+        cls, sizes: Sequence[int], start: Sequence[float], step: Sequence[float], edges: Sequence[int] = (_EDGE,) * 3
+    ) -> Bricks:
+        """Of so many coefficients, `edges` of them in a brick along the axes, more where there were too many bricks.
 
         Args:
             sizes: of the coefficients along every axis.
             start: coordinates of the first coefficient.
             step: from one to the next.
         """
-        while math.prod(-(-n // edge) for n in sizes) > _MOST_BRICKS:
-            edge *= 2
-        return cls(tuple(start), tuple(edge * s for s in step), tuple(-(-n // edge) for n in sizes))
+        while math.prod(-(-n // edge) for n, edge in zip(sizes, edges, strict=True)) > _MOST_BRICKS:
+            edges = [2 * edge for edge in edges]
+        own = list(zip(sizes, step, edges, strict=True))
+        return cls(tuple(start), tuple(edge * s for _, s, edge in own), tuple(-(-n // edge) for n, _, edge in own))
 
 
 class Sorted:

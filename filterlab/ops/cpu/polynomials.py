@@ -11,6 +11,10 @@ parts that are halved until the coefficients change their sign once at most.
 
 So a double root costs halvings, at most as many as floats have digits, and nothing that is found later has to be
 compared with it.
+
+All roots are met by going on in the same way. Every place of [0, 1] lies on a side: 1 where p > τ p̃, −1 where p < −τ p̃,
+and 0 between; a root is where a side 1 or −1 is left, and what stays on side 0 is the same root. p + τ p̃ tells of one
+side what p − τ p̃ tells of the other, and parts are halved until both change their sign once at most.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ from math import comb
 
 from llvmlite import ir
 
-from filterlab.ops.cpu.lanes import I8, Lanes, Value, Variable
+from filterlab.ops.cpu.lanes import I1, I8, I64, Kept, Lanes, Value, Variable
 from filterlab.ops.raycast import PASSES, USUAL
 from filterlab.roots import ROUNDINGS
 
@@ -96,7 +100,7 @@ class FirstRoot:
             found: is given a mask of those whose part was found, its coefficients, a and h; the others have none.
         """
         e, b = self.lanes, self.builder
-        one, two, half = e.constant(1), e.constant(2), e.constant(0.5)
+        one = e.constant(1)
         own, lowered = [e.kept(r) for r in rows], [e.kept(r) for r in self.lowered(rows)]
         left = e.variable(mask)
         a, h = e.variable(e.constant(0)), e.variable(one)
@@ -112,13 +116,18 @@ class FirstRoot:
                 found(holds, self.between([r.all(e.count) for r in own], a.value, end), a.value, h.value)
             halves = b.and_(left.value, b.and_(several, b.not_(narrow)))
             on = b.and_(b.and_(left.value, b.not_(holds)), b.not_(halves))
-            a.value = e.where(on, end, a.value)
-            doubled = e.multiply(h.value, two)
-            parts = e.divide(a.value, doubled)
-            wider = b.and_(on, b.fcmp_ordered("==", e.floor(parts), parts))
-            h.value = e.where(halves, e.multiply(h.value, half), e.where(wider, doubled, h.value))
+            a.value, h.value = self.moved(a.value, h.value, on, halves)
             over = b.and_(on, b.fcmp_ordered(">=", a.value, one))
             left.value = b.and_(left.value, b.not_(b.or_(holds, over)))
+
+    def moved(self, a: Value, h: Value, on: Value, halves: Value) -> tuple[Value, Value]:
+        """a and h of the next part, as wide as its place allows; or of the first half of this one."""
+        e, b = self.lanes, self.builder
+        a = e.where(on, e.add(a, h), a)
+        doubled = e.multiply(h, e.constant(2))
+        parts = e.divide(a, doubled)
+        wider = b.and_(on, b.fcmp_ordered("==", e.floor(parts), parts))
+        return a, e.where(halves, e.multiply(h, e.constant(0.5)), e.where(wider, doubled, h))
 
     def between(self, rows: Rows, start: Value, end: Value) -> Rows:
         """Coefficients on [start, end], by de Casteljau's algorithm at the end and, from there, at start / end."""
@@ -232,3 +241,78 @@ class FirstRoot:
         for r in reversed(rows[:-1]):
             value = self.lanes.multiply_add(value, u, r)
         return value
+
+
+class NextRoots(FirstRoot):
+    """Writes the search of one root after the other. Make it before any loop."""
+
+    def __init__(self, lanes: Lanes, degree: int) -> None:
+        super().__init__(lanes, degree)
+        zero, none = lanes.constant(0), ir.Constant(ir.VectorType(I1, lanes.count), None)
+        with lanes.builder.goto_entry_block():
+            self._rows, self._lowered, self._raised = ([lanes.kept() for _ in range(degree + 1)] for _ in range(3))
+        self._a, self._h, self._side, self._until = (lanes.variable(zero) for _ in range(4))
+        self._counted = lanes.variable(none)  # the root where this side is left was told of; it is left by `_until`
+
+    def begin(self, mask: Value, rows: Rows, side: Value) -> None:
+        """Of polynomials under the mask, which begin on a side; those of others are forgotten."""
+        e = self.lanes
+        for kept, numbers in (
+            (self._rows, rows),
+            (self._lowered, self.lowered(rows)),
+            (self._raised, self.lowered(rows, -1.0)),
+        ):
+            for pack, number in zip(kept, numbers, strict=True):
+                pack.set_part(I64(0), number)
+        self._a.value, self._h.value, self._side.value = e.constant(0), e.constant(1), side
+        self._counted.value = ir.Constant(mask.type, None)
+
+    def above(self) -> Value:
+        """A mask of those that are on side 1 now."""
+        return self.builder.fcmp_ordered(">", self._side.value, self.lanes.constant(0))
+
+    def next_part(self, mask: Value, found: Callable[[Value, Rows, Value, Value], None]) -> tuple[Value, Value]:
+        """Go on with the polynomials under a mask, each until it has a root, or is over.
+
+        Args:
+            found: as of `first_part`; coefficients are positive where the part begins.
+
+        Returns:
+            masks of those that were found, and of those that are over.
+        """
+        e, b = self.lanes, self.builder
+        none = ir.Constant(mask.type, None)
+        left, met, over = e.variable(mask), e.variable(none), e.variable(none)
+        with e.repeat_while(lambda: e.any(left.value)):
+            holds, past = self._step(left.value, found)
+            met.value, over.value = b.or_(met.value, holds), b.or_(over.value, past)
+            left.value = b.and_(left.value, b.not_(b.or_(holds, past)))
+        return met.value, over.value
+
+    def _step(self, left: Value, found: Callable[[Value, Rows, Value, Value], None]) -> tuple[Value, Value]:
+        """One part of each: masks of those that have a root there, and of those that are behind the last part."""
+        e, b, zero, one = self.lanes, self.builder, self.lanes.constant(0), self.lanes.constant(1)
+        a, h, side, counted = self._a.value, self._h.value, self._side.value, self._counted.value
+        end, narrow = e.add(a, h), b.fcmp_ordered("<=", h, e.constant(self.eps))
+        not_above = self.negative(self._on(self._lowered, a, end))
+        not_below = [b.fcmp_ordered(">=", r, zero) for r in self._on(self._raised, a, end)]
+        many = [b.not_(self.at_most_one(self.changes(flags))) for flags in (not_above, not_below)]
+        above, between = b.fcmp_ordered(">", side, zero), b.fcmp_ordered("==", side, zero)
+        several, leaves = b.select(above, *many), b.select(above, not_above[-1], not_below[-1])
+        holds = b.and_(b.and_(left, b.not_(b.or_(between, counted))), b.select(several, narrow, leaves))
+        with b.if_then(e.any(holds)):
+            found(holds, [e.multiply(side, r) for r in self._on(self._rows, a, end)], a, h)
+        counted = b.or_(counted, holds)
+        self._until.value = until = e.where(holds, end, self._until.value)
+        on = b.and_(left, b.or_(narrow, b.not_(b.or_(*many))))
+        self._a.value, self._h.value = self.moved(a, h, on, b.and_(left, b.not_(on)))
+        there = e.where(not_above[-1], e.where(not_below[-1], zero, e.constant(-1)), one)
+        left_behind = b.and_(counted, b.or_(leaves, several))
+        late = b.and_(counted, b.fcmp_ordered(">=", end, until))  # left within rounding
+        moved = e.where(b.or_(between, left_behind), there, e.where(late, zero, side))
+        self._side.value = e.where(on, moved, side)
+        self._counted.value = b.and_(counted, b.not_(b.and_(on, b.or_(left_behind, late))))
+        return holds, b.and_(on, b.fcmp_ordered(">=", end, one))
+
+    def _on(self, kept: Sequence[Kept], a: Value, end: Value) -> Rows:
+        return self.between([pack.all(self.lanes.count) for pack in kept], a, end)

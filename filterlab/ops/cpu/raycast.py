@@ -1,7 +1,8 @@
 """Casting rays as vector code: describes lattices and rays to the programs of `ops.cpu.crossings`.
 
-Memory beyond the result: two bytes for every brick; for candidates 24 + 1 bytes and n + 1 numbers for every ray and
-each of the `capacity` that there is room for.
+Memory beyond the result: two bytes for every brick; for sheets 8 bytes for every ray, and as much as the result once or
+twice more for the farthest; for candidates 24 + 1 bytes and n + 1 numbers for every ray and each of the `capacity` that
+there is room for.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.machine import lanes_of
 from filterlab.ops.cpu.memory import ARITHMETIC, has_room
 from filterlab.ops.gather import STORAGE, in_whole_rows
-from filterlab.ops.raycast import RADII, Candidates, Raycast, Written, written_in_parts
+from filterlab.ops.raycast import RADII, Candidates, Raycast, Sheets, Written, written_in_parts
 
 _WASTED = 17 / 16  # places for rays in packs of two rows, over rays: more would take back most of what is gained
 
@@ -29,6 +30,16 @@ def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
     if t.numel():
         _Cast(given, "first", origins, directions).run(t=t)
     return t
+
+
+def sheets(given: Raycast, origins: Tensor, directions: Tensor, asked: Sheets) -> Tensor:
+    """`ops.reference.raycast.sheets`, fused: t (..., k) float64 of rays (..., 3), without derivatives."""
+    t, count = asked.room(origins.shape[:-1], origins.device)
+    if t.numel():
+        cast = _Cast(given, "sheets", origins, directions)
+        cast.job.sheets, cast.job.most, cast.job.extent = asked.count, asked.most, asked.extent
+        cast.run(t=t, count=count)
+    return asked.in_order(t, count)
 
 
 def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidates:

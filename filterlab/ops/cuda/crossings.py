@@ -21,9 +21,11 @@ from filterlab.ops.raycast import Written
 from filterlab.ops.tetrahedra import LoweredStencil, TetrahedralStencil
 
 ARRAYS = ("coefficients", *cells.ARRAYS)
-SIZES = ("width", "height", *cells.SIZES, "capacity")
-NUMBERS = (*cells.NUMBERS, "gain", "shift")
-"""f − level is gain · sum + shift."""
+SIZES = ("width", "height", *cells.SIZES, "capacity", "most")
+"""capacity: candidates or sheets of a ray that there is room for; most: sheets behind which no more are looked for."""
+
+NUMBERS = (*cells.NUMBERS, "gain", "shift", "extent")
+"""f − level is gain · sum + shift; extent: the diagonal of the domain, in the world."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class RaycastVariant:
     """Everything a program depends on; can be hashed.
 
     Attributes:
-        asked: "first" or "candidates".
+        asked: "first", "candidates" or "sheets".
         stencil: what is summed, one row.
         degree: n, along a ray.
         continuous: whether polynomials of neighbouring cells agree where they meet.
@@ -46,8 +48,8 @@ class RaycastVariant:
 
     @property
     def own(self) -> tuple[str, ...]:
-        """Arrays that are written: t (R,); or those of `ops.raycast.Written`."""
-        return ("t",) if self.asked == "first" else Written._fields
+        """Arrays that are written: t (R,), or (R, k), and count (R,); or those of `ops.raycast.Written`."""
+        return {"first": ("t",), "sheets": ("t", "count"), "candidates": Written._fields}[self.asked]
 
     def write(self) -> Source:
         return _Program(self).write()
@@ -76,6 +78,7 @@ class _Program:
         line(f"arithmetic = tl.{self.variant.arithmetic}")
         for name in ("gain", "shift"):
             line(f"{name} = tl.load(numbers + {NUMBERS.index(name)}).to(arithmetic)")
+        line(f"extent = tl.load(numbers + {NUMBERS.index('extent')})")
         line("width, height = width.to(tl.int64), height.to(tl.int64)")
         line("nothing = tl.full((BLOCK,), 0.0, arithmetic)")
         self.walk.begin()
@@ -83,11 +86,11 @@ class _Program:
         line("before = nothing")
         self.taker.begin()
         searching = f"going & ~{self.taker.waiting}"
-        with self.walk.while_any(searching):
+        with self.taker.rounds(), self.walk.while_any(searching):
             self.walk.next_cells(searching)
             with self.walk.if_any("found"):
                 self._in_cells()
-                with self.restriction.every("row", "found", self.taker.waiting) as section:
+                with self.restriction.every("row", "found", self.taker.done) as section:
                     self._piece(section)
                     with self.walk.if_any("holds"):
                         self.taker.take(self.rows, section.near, section.far, "jump")

@@ -85,12 +85,18 @@ class FirstRoot:
                 line(f"{met} = {met} | holds")
             line("halves = left & several & ~narrow")
             line("moves = left & ~holds & ~halves")
-            line("a = tl.where(moves, end_, a)")
-            line("doubled = a * (parts * 0.5)")
-            line("wider = moves & (tl.floor(doubled) == doubled)")
-            line("h = tl.where(halves, h * 0.5, tl.where(wider, h * 2.0, h))")
-            line("parts = tl.where(halves, parts * 2.0, tl.where(wider, parts * 0.5, parts))")
+            self._move("a", "h", "parts")
             line("left = left & ~(holds | (moves & (a >= 1.0)))")
+
+    def _move(self, a: str, h: str, parts: str) -> None:
+        """To the next part, as wide as its place allows, or to the first half of this one."""
+        self.source.lines(f"""
+            {a} = tl.where(moves, end_, {a})
+            doubled = {a} * ({parts} * 0.5)
+            wider = moves & (tl.floor(doubled) == doubled)
+            {h} = tl.where(halves, {h} * 0.5, tl.where(wider, {h} * 2.0, {h}))
+            {parts} = tl.where(halves, {parts} * 2.0, tl.where(wider, {parts} * 0.5, {parts}))
+        """)
 
     def _between(self, into: str, rows: Sequence[str], start: str, end: str) -> list[str]:
         """Coefficients on [start, end], by de Casteljau's algorithm at the end and, from there, at start / end."""
@@ -174,11 +180,11 @@ class FirstRoot:
         """One step of Newton's method, where p falls and it leads nearer to a root with nothing between."""
         line, rows = self.line, self.names("own")
         self._horner(rows, "u")
-        line("before, steep = value, slope")
-        line("new = u - before / steep")
+        line("value_there, steep = value, slope")
+        line("new = u - value_there / steep")
         self._horner(rows, "new")
         line("change = slope / steep")
-        line("good = (tl.abs(value) <= 0.5 * tl.abs(before)) & (change > 0.5) & (change < 2.0)")
+        line("good = (tl.abs(value) <= 0.5 * tl.abs(value_there)) & (change > 0.5) & (change < 2.0)")
         line("u = tl.where(good & (steep < 0.0) & (new >= 0.0) & (new <= 1.0), new, u)")
 
     def _horner(self, rows: Sequence[str], u: str) -> None:
@@ -197,3 +203,75 @@ class FirstRoot:
 
     def _while(self, mask: str, also: str = "") -> AbstractContextManager[None]:
         return self.source.block(f"while ({any_of(mask)})" + (f" & ({also})" if also else ""))
+
+
+class NextRoots(FirstRoot):
+    """Writes the search of one root after the other (`ops.cpu.polynomials.NextRoots`).
+
+    Between roots `sweep_a`, `sweep_h` and `sweep_parts` tell the part, `side` the side there, `counted` and `until`
+    whether the root where it is left was told of, and where it is left at the latest.
+    """
+
+    def begin(self) -> None:
+        super().begin()
+        self.start("nothing")
+
+    def start(self, side: str) -> None:
+        """Of other polynomials, which begin on a side."""
+        self.source.lines(f"""
+            sweep_a, sweep_h, sweep_parts, until = nothing, nothing + 1.0, nothing + 1.0, nothing
+            side = {side}
+            counted = inside & (ray < 0)
+        """)
+
+    def next_part(self, mask: str, rows: Sequence[str]) -> None:
+        """Go on with the polynomials under the mask, each until its root is `met`, or it is `over`."""
+        self.source.lines(f"""
+            left = {mask}
+            met, over_ = left & (ray < 0), left & (ray < 0)
+        """)
+        with self._while("left"):
+            self._signs(rows)
+            self.line("told = left & (side != 0.0) & ~counted & tl.where(several, narrow, leaves)")
+            with self.source.block(f"if {any_of('told')}"):
+                here = self._between("here", rows, "sweep_a", "end_")
+                self.assign("told", [f"side * {row}" for row in here], "sweep_a", "sweep_h")
+            self.line("until = tl.where(told, end_, until)")
+            self._onward()
+
+    def _signs(self, rows: Sequence[str]) -> None:
+        """Of one part: `several`, changes of the side's own sign, and whether it `leaves` that; `many`, of either."""
+        self.line("end_ = sweep_a + sweep_h")
+        for name, times in (("above", 1.0), ("below_", -1.0)):
+            own = self.lower("low", rows, times)
+            if times < 0:
+                for row in own:
+                    self.line(f"{row} = -{row}")
+            self.count_changes(self._between("here", own, "sweep_a", "end_"))
+            self.line(f"often_{name}, not_{name} = changes > 1, below")
+        self.source.lines(f"""
+            narrow = sweep_h <= {number(self.eps)}
+            several = tl.where(side > 0.0, often_above, often_below_)
+            leaves = tl.where(side > 0.0, not_above, not_below_)
+            often = often_above | often_below_
+        """)
+
+    def _onward(self) -> None:
+        """To the next part, or to the first half of this one."""
+        self.source.lines("""
+            counted = counted | told
+            moves = left & (narrow | ~often)
+            halves = left & ~moves
+            behind = counted & (leaves | several)
+            late = counted & (end_ >= until)  # left within rounding
+            there = tl.where(not_above, tl.where(not_below_, nothing, nothing - 1.0), nothing + 1.0)
+            moved = tl.where((side == 0.0) | behind, there, tl.where(late, 0.0, side))
+            side = tl.where(moves, moved, side)
+            counted = counted & ~(moves & (behind | late))
+        """)
+        self._move("sweep_a", "sweep_h", "sweep_parts")
+        self.source.lines("""
+            past = moves & (end_ >= 1.0)
+            met, over_ = met | told, over_ | past
+            left = left & ~(told | past)
+        """)

@@ -17,7 +17,7 @@ from filterlab.ops.cuda.crossings import ARRAYS, NUMBERS, SIZES, RaycastVariant
 from filterlab.ops.cuda.launch import interpreting, launchable
 from filterlab.ops.cuda.taps import AXES
 from filterlab.ops.gather import in_whole_rows
-from filterlab.ops.raycast import Candidates, Raycast, Written, written_in_parts
+from filterlab.ops.raycast import Candidates, Raycast, Sheets, Written, written_in_parts
 
 
 def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
@@ -25,6 +25,14 @@ def first(given: Raycast, origins: Tensor, directions: Tensor) -> Tensor:
     t = torch.empty(origins.shape[:-1], dtype=torch.float64, device=origins.device)
     _cast(given, "first", origins.reshape(-1, 3), directions.reshape(-1, 3), {"t": t})
     return t
+
+
+def sheets(given: Raycast, origins: Tensor, directions: Tensor, asked: Sheets) -> Tensor:
+    """`ops.reference.raycast.sheets`, fused: t (..., k) float64 of rays (..., 3), without derivatives."""
+    t, count = asked.room(origins.shape[:-1], origins.device)
+    rays, own = (origins.reshape(-1, 3), directions.reshape(-1, 3)), {"t": t, "count": count}
+    _cast(given, "sheets", *rays, own, asked.count, asked.most, asked.extent)
+    return asked.in_order(t, count)
 
 
 def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidates:
@@ -39,31 +47,38 @@ def candidates(given: Raycast, origins: Tensor, directions: Tensor) -> Candidate
 
 
 def _cast(
-    given: Raycast, asked: str, origins: Tensor, directions: Tensor, own: Mapping[str, Tensor], capacity: int = 0
+    given: Raycast,
+    asked: str,
+    origins: Tensor,
+    directions: Tensor,
+    own: Mapping[str, Tensor],
+    capacity: int = 0,
+    most: int = 0,
+    extent: float = 0.0,
 ) -> None:
-    """Run a program for all rays; `own` is what it writes."""
+    """Run a program for all rays; `own` is what it writes, the rest as in `ops.cuda.crossings`."""
     if not len(origins):
         return
     lattice = given.lattice
     arithmetic = str(given.dtype).removeprefix("torch.")
     variant = RaycastVariant(asked, lattice.stencil.lowered, lattice.degree, lattice.continuous, arithmetic)
     rays = {"origins": origins.to(given.dtype), "directions": directions.to(given.dtype)}
-    arrays = {**rays, "marks": given.marks, "numbers": _numbers(given), **own}
+    arrays = {**rays, "marks": given.marks, "numbers": _numbers(given, extent), **own}
     coefficients = in_whole_rows(lattice.coefficients)
     handed = [arrays[name].detach().resolve_neg().contiguous() for name in (*ARRAYS[1:], *variant.own)]
-    sizes = {**_sizes(given, coefficients), "rays": len(origins), "capacity": capacity}
+    sizes = {**_sizes(given, coefficients), "rays": len(origins), "capacity": capacity, "most": most}
     program = _program(variant, interpreting())
     with torch.cuda.device_of(coefficients):  # Triton launches on the current device
         arguments = (coefficients, *handed, *(sizes[name] for name in SIZES))
         program[(-(-len(origins) // BLOCK),)](*arguments, BLOCK=BLOCK, num_warps=1)
 
 
-def _numbers(given: Raycast) -> Tensor:
+def _numbers(given: Raycast, extent: float) -> Tensor:
     lattice, geometry = given.lattice, given.geometry
     triples = {"origin": geometry.origin, "offset": lattice.offset, "lower": lattice.lower, "upper": lattice.upper}
     numbers = {f"{name}_{a}": x for name, triple in triples.items() for a, x in zip(AXES, triple, strict=True)}
     numbers |= {f"matrix_{i}{k}": x for i, row in enumerate(geometry.inverse) for k, x in enumerate(row)}
-    numbers |= {"infinity": torch.inf, "gain": lattice.scale, "shift": lattice.shift - given.level}
+    numbers |= {"infinity": torch.inf, "gain": lattice.scale, "shift": lattice.shift - given.level, "extent": extent}
     ordered = [float(numbers[name]) for name in NUMBERS]
     return torch.tensor(ordered, dtype=torch.float64, device=lattice.coefficients.device)
 

@@ -6,6 +6,8 @@ from functools import cache
 from importlib import import_module
 from types import ModuleType
 
+import torch
+
 from filterlab import forking
 
 
@@ -17,3 +19,8 @@ def driver(implementation: str, op: str) -> ModuleType:
     """
     with forking.lock:
         return import_module(f"filterlab.ops.{implementation}.{op}")
+
+
+def room_of(device: torch.device) -> str:
+    """The room of programs for tensors on a device: "cuda" for a GPU, else "cpu"."""
+    return "cuda" if device.type == "cuda" else "cpu"

@@ -7,7 +7,7 @@ from types import ModuleType
 from torch import Tensor
 
 from filterlab.ops import cpu, cuda
-from filterlab.ops.differentiable.drivers import driver
+from filterlab.ops.differentiable.drivers import driver, room_of
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.gather import STORAGE
 from filterlab.ops.height_hits import Cell, HeightHits
@@ -23,7 +23,7 @@ def missing(heights: Heights) -> str | None:
     if transforming():
         return "it has no transforms of torch.func"
     values = heights.values
-    if problem := cuda.device_problem(values) if values.device.type == "cuda" else cpu.llvmlite_problem():
+    if problem := cuda.device_problem(values) if room_of(values.device) == "cuda" else cpu.llvmlite_problem():
         return problem
     if values.device.type not in ("cpu", "cuda") or values.dtype not in STORAGE:
         return f"it reads {', '.join(STORAGE.values())} on the CPU or a GPU; got {values.dtype} on {values.device}"
@@ -70,5 +70,5 @@ def _driver(given: HeightHits, origins: Tensor, implementation: str | None) -> M
 
 def _implementation_for(heights: Heights) -> str:
     """What casts rays at these unasked: "cpu" (vector code), or "cuda" (Triton) on a GPU; else plain torch."""
-    fused = "cuda" if heights.values.device.type == "cuda" else "cpu"
+    fused = room_of(heights.values.device)
     return fused if missing(heights) is None else "reference"

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops import cpu, cuda
-from filterlab.ops.differentiable.drivers import driver
+from filterlab.ops.differentiable.drivers import driver, room_of
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.heights import DEGREE, Heights, raised, rows, unsupported
 from filterlab.ops.reference import heights as reference
@@ -40,7 +40,7 @@ def jet(heights: Heights, points: Tensor, order: int, implementation: str | None
         implementation: "reference", "cpu" or "cuda"; None: the fastest one that can run.
     """
     if implementation is None:
-        fused = "cuda" if points.device.type == "cuda" else "cpu"
+        fused = room_of(points.device)
         implementation = fused if missing(fused, heights, points) is None else "reference"
     if implementation == "reference":
         return reference.jet(heights, points, order)

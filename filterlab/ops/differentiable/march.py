@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops import cpu, cuda
-from filterlab.ops.differentiable.drivers import driver
+from filterlab.ops.differentiable.drivers import driver, room_of
 from filterlab.ops.differentiable.gather import gather
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.march import MAX_LIGHTS, Bricks, March
@@ -36,7 +36,7 @@ Preparation = Callable[[Mapping[str, Tensor]], March]
 
 def implementation_for(coefficients: Tensor) -> str:
     """What marches rays through these coefficients: "cpu" (vector code), or "cuda" (Triton) on a GPU."""
-    return "cuda" if coefficients.device.type == "cuda" else "cpu"
+    return room_of(coefficients.device)
 
 
 def missing(coefficients: Tensor, stencil: AnyStencil, start: int, dtype: torch.dtype, lights: int) -> str | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from filterlab.ops import cpu, cuda
-from filterlab.ops.differentiable.drivers import driver
+from filterlab.ops.differentiable.drivers import driver, room_of
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.quadrics import InLeaves
 
@@ -47,5 +47,5 @@ def hits(
 
 def implementation_for(given: InLeaves, origins: Tensor) -> str:
     """What casts these rays unasked: "cpu" (vector code), or "cuda" (Triton) on a GPU; else plain torch."""
-    fused = "cuda" if given.leaves.device.type == "cuda" else "cpu"
+    fused = room_of(given.leaves.device)
     return fused if missing(given, origins) is None else "reference"

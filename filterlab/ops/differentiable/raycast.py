@@ -7,9 +7,9 @@ from torch import Tensor
 
 from filterlab.ops import cpu, cuda
 from filterlab.ops import raycast as description
-from filterlab.ops.differentiable.drivers import driver
+from filterlab.ops.differentiable.drivers import driver, room_of
 from filterlab.ops.differentiable.recording import transforming
-from filterlab.ops.raycast import Candidates, Raycast
+from filterlab.ops.raycast import Candidates, Raycast, Sheets
 from filterlab.ops.tetrahedra import AnyLattice
 
 _FEWEST = 1 << 13
@@ -44,6 +44,13 @@ def first(given: Raycast, origins: Tensor, directions: Tensor, implementation: s
     return _driver(given, origins, implementation).first(given, origins, directions)
 
 
+def sheets(
+    given: Raycast, origins: Tensor, directions: Tensor, asked: Sheets, implementation: str | None = None
+) -> Tensor:
+    """t (..., k) float64, where rays (..., 3) meet the level; ∞ where they no longer do. Arguments as for `first`."""
+    return _driver(given, origins, implementation).sheets(given, origins, directions, asked)
+
+
 def candidates(given: Raycast, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Candidates:
     """The pieces of rays (R, 3) that may hold a crossing, those of a ray in order. Arguments as for `first`."""
     return _driver(given, origins, implementation).candidates(given, origins, directions)
@@ -69,4 +76,4 @@ def _driver(given: Raycast, origins: Tensor, implementation: str | None):
 
 def _implementation_for(lattice: AnyLattice) -> str:
     """What casts rays at these coefficients: "cpu" (vector code), or "cuda" (Triton) on a GPU."""
-    return "cuda" if lattice.coefficients.device.type == "cuda" else "cpu"
+    return room_of(lattice.coefficients.device)
