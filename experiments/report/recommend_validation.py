@@ -162,7 +162,8 @@ def _groups(volumes: Sequence[Record], caption: str, key: Callable[[Record, Any]
         groups = {}
         for record, found in pairs:
             groups.setdefault(key(record, found), []).append(outcomes(record, found))
-    rows = [[name, *(_rate(_together(iter(parts))[k]) for k in [*BARS][: len(TITLES)])] for name, parts in sorted(groups.items())]
+    told = [*BARS][: len(TITLES)]
+    rows = [[name, *(_rate(_together(iter(parts))[k]) for k in told)] for name, parts in sorted(groups.items())]
     return Table(columns, rows, caption)
 
 
