@@ -41,6 +41,7 @@ from filterlab.recommendation.choice import TASKS, Candidate, Question, Recommen
 from filterlab.recommendation.errors import SURE, MethodErrors, Yardstick
 from filterlab.recommendation.survey import inner_box
 from filterlab.recommendation.ways import Way, WayCost, costs_of, ways_of
+from filterlab.render.rays import slab
 from filterlab.scenes.model import MethodName
 from filterlab.signals import Signal
 from filterlab.surfaces import LevelSet
@@ -160,9 +161,12 @@ def _carried_over(costs: Mapping[tuple[Way, int], WayCost], task: str, voxels: i
 
 @dataclass(frozen=True)
 class Truth:
-    """True errors of a field: of value and gradient, and the second derivative along lines; in parts of the range.
+    """True errors of a field, in parts of the range.
 
-    seen: the greater of the errors of value and gradient in a picture.
+    Attributes:
+        value, gradient: of these, over the region that is promised.
+        bend: the second derivative along lines.
+        seen: the greater of the errors of value and gradient in a picture; None: there is none, or few rays hit.
     """
 
     value: float
@@ -212,8 +216,7 @@ class Picture:
         steps = torch.linspace(-0.5, 0.5, _PIXELS, dtype=torch.float64) * float((upper - lower).norm())
         across = torch.cartesian_prod(steps, steps)
         middle = (lower + upper) / 2 + across[:, :1] * basis[0] + across[:, 1:] * basis[1]
-        ends = torch.stack([(corner - middle) / basis[2] for corner in (lower, upper)])
-        near, far = ends.amin(0).amax(-1), ends.amax(0).amin(-1)
+        near, far = slab(middle, basis[2].expand_as(middle), lower.tolist(), upper.tolist())
         o, d = middle + near[:, None] * basis[2], (far - near)[:, None] * basis[2]
         rank = subject.value.argsort()
         below = subject.weights[rank].cumsum(0) <= random.uniform(*_LEVELS)
@@ -292,13 +295,11 @@ def _answers(
     volume = as_volume(subject.volume)
     for task in TASKS if subject.differentiable else TASKS[:1]:
         taken = _carried_over(costs, task, subject.volume.numel())
+        pictured = task == "isosurface" and all(t.seen is not None for way, t in truths.items() if way[0] != "nearest")
         for near, budget in _budgets(config, task, truths, random):
             question = Question(task, budget, math.inf, math.inf, str(yardstick.boundary), "refuse")
             answer = choose(question, volume, yardstick, errors, taken)
             found = {"near": near, **judged(answer, partial(_true, task, truths))}
-            pictured = task == "isosurface" and all(
-                t.seen is not None for way, t in truths.items() if way[0] != "nearest"
-            )
             yield found | ({"pictured": judged(answer, partial(_seen, truths))} if pictured else {})
 
 

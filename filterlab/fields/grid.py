@@ -25,7 +25,6 @@ from filterlab.kernels import Factor, Kernel, PiecewisePolynomial
 from filterlab.ops.differentiable import raycast as casting
 from filterlab.ops.differentiable.drivers import room_of
 from filterlab.ops.differentiable.prefilter import implementation_for
-from filterlab.ops.differentiable.recording import plain
 from filterlab.ops.pieces import Lattice, Pieces
 from filterlab.ops.place import Placement
 from filterlab.ops.prefilter import VOLUME
@@ -423,8 +422,8 @@ class GridField(Field):
         out = [value.squeeze(axis)]
         if order >= 1:
             gradient = others[0].movedim(axis, -1)
-            if sign is not None:  # nobody else has rows that nothing is recorded of: new memory takes twice the time
-                gradient = gradient.mul_(sign) if plain(gradient) else gradient * sign
+            if sign is not None:
+                gradient = gradient * sign
             out.append(self.domain.geometry.gradient_to_world(gradient))
         if order >= 2:
             hessian = _symmetric(others[1], axis)
