@@ -183,6 +183,7 @@ class _Program:
     def _advance(self) -> None:
         """Who is `ahead` goes to the beginning of the next block."""
         self.line("leaves, fits = ahead & (ray < 0), ahead")
+        self.line(f"up = tl.where(level >= {self.cell.finest}, level + 1, {self.cell.finest})")
         for a, across in (("x", "~along_y"), ("y", "along_y")):
             self.lines(f"""
                 least = (cell_{a} >> level) << level
@@ -191,13 +192,14 @@ class _Program:
                 place = tl.floor(out * speed_{a} + entry_{a}).to(tl.int32)
                 place = tl.minimum(tl.maximum(place, tl.where(forward_{a} > 0, cell_{a}, least)), most)
                 new = tl.where({across}, tl.where(forward_{a} > 0, next_, least - 1), place)
-                leaves = leaves | ((new >> (level + 1)) != (cell_{a} >> (level + 1)))
+                leaves = leaves | ((new >> up) != (cell_{a} >> up))
                 fits = fits & (new >= 0) & (new < cells_{a})
                 cell_{a} = tl.where(ahead, new, cell_{a})
             """)
-        self.lines("""
-            higher = tl.where(leaves, tl.minimum(level + 1, highest), level)
-            level = tl.where(ahead, higher, tl.where(down, level - 1, level))
+        self.lines(f"""
+            higher = tl.where(leaves, tl.minimum(up, highest), level)
+            lower = tl.where(level > {self.cell.finest}, level - 1, 0)
+            level = tl.where(ahead, higher, tl.where(down, lower, level))
             s = tl.where(ahead, out, s)
             going = going & (~ahead | (fits & (out < end)))
         """)
