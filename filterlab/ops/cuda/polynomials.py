@@ -251,7 +251,7 @@ class NextRoots(FirstRoot):
             self.count_changes(self._between("here", own, "sweep_a", "end_"))
             self.line(f"often_{name}, not_{name} = changes > 1, below")
         self.source.lines(f"""
-            rises = (here_0 > 0.0) & (here_{self.degree - 1} <= 0.0)  # before the end, at which it then comes from above
+            rises = (here_0 > 0.0) & (here_{self.degree - 1} <= 0.0)  # before the end, at which it is from above
             often_below_ = often_below_ | (rises & sweep_ends & (end_ >= 1.0))
             narrow = sweep_h <= {number(self.eps)}
             several = tl.where(side > 0.0, often_above, often_below_)
