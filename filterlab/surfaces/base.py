@@ -155,7 +155,7 @@ class Surface(ABC):
 
     @abstractmethod
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        """The first hits (R, sheets) in order, or the last ones from the last on."""
+        """The first hits (..., sheets) of rays (..., 3) in order, or the last ones from the last on; or (R, sheets)."""
 
     def hit(self, origins: Array, directions: Array) -> Hits:
         """The first hit of every ray in the domain, t ≥ 0.
@@ -192,8 +192,8 @@ class Surface(ABC):
         """
         check_sheets(sheets)
         origins, directions = check_rays(origins, directions)
-        o, d = (x.detach().reshape(-1, 3) for x in (origins, directions))
-        found = self.detached._sheets(o, d, sheets, farthest).of_rays((*origins.shape[:-1], sheets), origins.dtype)
+        found = self.detached._sheets(origins.detach(), directions.detach(), sheets, farthest)
+        found = found.of_rays((*origins.shape[:-1], sheets), origins.dtype)
         return self._attached(found, origins[..., None, :], directions[..., None, :])
 
     def clearance(self, hit: Hits) -> Tensor:

@@ -198,6 +198,10 @@ class Lanes:
         """A mask: a < b, false where either is NaN."""
         return self.builder.fcmp_ordered("<", a, b)
 
+    def mask(self, value: bool) -> Value:
+        """The same in every lane."""
+        return ir.Constant(ir.VectorType(I1, self.count), [value] * self.count)
+
     def both(self, a: Value, b: Value) -> Value:
         """A mask: where two masks hold."""
         return self.builder.and_(a, b)
