@@ -299,8 +299,8 @@ class _Program:
     def _jet(self, index: Value, s: Value, t: Value, down: Value) -> list[Value]:
         e = self.lanes
         forward = self._forward(down)
-        base = self.data.first(index, forward)
-        coefficients = self.masks.coefficients(e.subtract(datum, base) for datum in self.data.read(index, forward))
+        base, data = self.data.read(index, forward)
+        coefficients = self.masks.coefficients(e.subtract(datum, base) for datum in data)
         found = self.masks.derivatives(coefficients, self._barycentric(s, t), self.variant.order)
         value, *others = (e.multiply(own, factor) for own, factor in zip(found, self._factors(down), strict=True))
         value = e.add(value, base)
