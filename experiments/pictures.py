@@ -4,6 +4,10 @@ Letters: R rays, K cells of a ray, S steps of a march, N segments of each; T tra
 
 What is judged is what a picture shows, not its pixels: a pixel of a medium is a mean along its ray, in which errors
 cancel. It can be right where all that it shows is wrong.
+
+Half of the levels are drawn by volume: that much of the region is below them, and often they lie in what is nearly even.
+Half are drawn by detail, |∇f| dV, which is what the surfaces of all levels have of area (the coarea formula): they lie
+where the signal changes.
 """
 
 from __future__ import annotations
@@ -25,7 +29,10 @@ from filterlab.signals import Signal
 from filterlab.surfaces import LevelSet
 
 _PIXELS = 40  # along an edge of a picture
-_LEVELS = 0.2, 0.8  # parts of the region that may be below a level
+LEVELS = ("volume", "detail")
+"""By what the levels of pictures are drawn."""
+
+_BELOW = 0.2, 0.8  # parts of it that may be below a level
 _FEW = 100  # hits, or rays, that say nothing
 _FAINT = 0.02  # opacity of a ray on which hardly anything is seen
 _WIDTHS = 0.03, 1.0  # of a medium, in parts of the range, log-uniform
@@ -44,6 +51,7 @@ class Picture:
         signal: the truth.
         span: the range that errors are parts of.
         level: of the surface.
+        drawn_by: of `LEVELS`.
         region: corners of the box that is promised.
         origins, directions: (R, 3), where rays enter the region, and from there to where they leave it.
     """
@@ -51,13 +59,14 @@ class Picture:
     signal: Signal
     span: float
     level: float
+    drawn_by: str
     region: Region
     origins: Tensor
     directions: Tensor
 
     @classmethod
     def of(cls, subject: Subject, span: float, random: np.random.Generator) -> Picture:
-        """Seen from a direction drawn at random, as the level that a part of the region drawn at random is below."""
+        """Seen from a direction drawn at random, as the level that a part drawn at random is below."""
         lower, upper = inner_box(subject.volume.shape)  # type: ignore[arg-type]
         region = lower.tolist(), upper.tolist()
         basis = torch.linalg.qr(torch.tensor(random.standard_normal((3, 3))))[0]
@@ -66,10 +75,9 @@ class Picture:
         middle = (lower + upper) / 2 + across[:, :1] * basis[0] + across[:, 1:] * basis[1]
         near, far = slab(middle, basis[2].expand_as(middle), *region)
         o, d = middle + near[:, None] * basis[2], (far - near)[:, None] * basis[2]
-        rank = subject.value.argsort()
-        below = subject.weights[rank].cumsum(0) <= random.uniform(*_LEVELS)
-        level = float(subject.value[rank[int(below.sum())]])
-        return cls(subject.signal, span, level, region, o[near < far], d[near < far])
+        drawn_by = LEVELS[int(random.integers(2))]
+        level = level_of(subject, drawn_by, random.uniform(*_BELOW))
+        return cls(subject.signal, span, level, drawn_by, region, o[near < far], d[near < far])
 
     def error(self, field: fl.Field) -> float | None:
         """As an isosurface counts it, of the hits that are seen; None: there are few."""
@@ -186,6 +194,15 @@ class Pictures:
 
 
 NO_PICTURES = Pictures()
+
+
+def level_of(subject: Subject, drawn_by: str, part: float) -> float:
+    """The level that a part of the volume, or of its detail, is below."""
+    amount = subject.weights * (1.0 if drawn_by == "volume" else subject.gradient.norm(dim=-1))
+    rank = subject.value.argsort()
+    sums = amount[rank].cumsum(0)
+    below = int((sums <= part * sums[-1]).sum())
+    return float(subject.value[rank[min(below, len(rank) - 1)]])
 
 
 def medium(level: float, span: float, random: np.random.Generator) -> TransferFunction:

@@ -13,8 +13,9 @@ For isosurfaces and dvr the same is judged by pictures too, seen from anywhere:
     dvr             of a translucent medium: errors of value and gradient where a march samples, and what it loses over
                     its segments, all weighted by what the picture of the true signal shows of each segment
 
-A pixel of a medium is a mean along its ray, in which errors cancel: it can be right where what it shows is wrong, and
-so refutes no refusal. Of a pick the rendered picture is set beside that of the signal all the same.
+Levels are drawn by volume or by detail, see `pictures`. A pixel of a medium is a mean along its ray, in which errors
+cancel: it can be right where what it shows is wrong, and so refutes no refusal. Of a pick the rendered picture is set
+beside that of the signal all the same.
 
 Budgets are drawn log-uniform, half of them between 0.01 % and 10 %, as people ask; the other half from a quarter of the
 least true error to four times the largest, where answers are hardest. Costs are measured once, on one volume, and
@@ -38,7 +39,7 @@ from pydantic import Field, model_validator
 import filterlab as fl
 from experiments.config import ExperimentConfig, VolumeChoice, number
 from experiments.members import seed_of
-from experiments.pictures import NO_PICTURES, Cloud, Pictures
+from experiments.pictures import NO_PICTURES, Pictures
 from experiments.runs import Record, Run, Unit
 from experiments.variety import CLASSES, Subject, of_class, of_scan, size_of
 from filterlab.methods import METHODS
@@ -222,7 +223,7 @@ def _judged(
         "doubts": dict(yardstick.doubts),
         "bend": [yardstick.bend, next(iter(truths.values())).bend],
         "ways": list(_compared(yardstick, errors, truths)),
-        "answers": list(_answers(config, subject, yardstick, errors, truths, costs, pictures.cloud, random)),
+        "answers": list(_answers(config, subject, yardstick, errors, truths, costs, pictures, random)),
     }
 
 
@@ -251,7 +252,7 @@ def _answers(
     errors: Mapping[Way, MethodErrors],
     truths: Mapping[Way, Truth],
     costs: Mapping[tuple[Way, int], WayCost],
-    cloud: Cloud | None,
+    pictures: Pictures,
     random: np.random.Generator,
 ) -> Iterator[dict[str, Any]]:
     """For every task and budget."""
@@ -262,20 +263,20 @@ def _answers(
             question = Question(task, budget, math.inf, math.inf, str(yardstick.boundary), "refuse")
             answer = choose(question, volume, yardstick, errors, taken)
             found = {"near": near, **judged(answer, partial(_true, task, truths))}
-            yield found | _by_pictures(answer, subject, truths, cloud)
+            yield found | _by_pictures(answer, subject, truths, pictures)
 
 
 def _by_pictures(
-    answer: Recommendation, subject: Subject, truths: Mapping[Way, Truth], cloud: Cloud | None
+    answer: Recommendation, subject: Subject, truths: Mapping[Way, Truth], pictures: Pictures
 ) -> dict[str, Any]:
     """The answer judged by pictures, and the picture of a pick beside the true one; nothing where there are none."""
     seen = [t.pictured(answer.best.step) for way, t in truths.items() if way[0] != "nearest"]  # it has few levels
-    if answer.task == "resample" or None in seen:
+    if pictures.picture is None or answer.task == "resample" or None in seen:
         return {}
-    pictured = judged(answer, partial(_seen, truths))
-    if answer.pick is None or answer.pick.step is None or cloud is None:
-        return {"pictured": pictured}
-    return {"pictured": pictured, "rendered": number(cloud.rendered(answer.field(subject.volume), answer.pick.step))}
+    found = {"level": pictures.picture.drawn_by, "pictured": judged(answer, partial(_seen, truths))}
+    if answer.pick is None or answer.pick.step is None or pictures.cloud is None:
+        return found
+    return found | {"rendered": number(pictures.cloud.rendered(answer.field(subject.volume), answer.pick.step))}
 
 
 def _seen(truths: Mapping[Way, Truth], candidate: Candidate) -> float:

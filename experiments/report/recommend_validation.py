@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from matplotlib.axes import Axes
 
+from experiments.pictures import LEVELS
 from experiments.recommend_validation import FACTOR, HALVES, fitted
 from experiments.report import plots
 from experiments.report.page import Block, Column, Plot, Section, Table
@@ -16,7 +17,8 @@ from experiments.runs import Record
 from filterlab.recommendation.calibration import CALIBRATION, FALLS
 
 if TYPE_CHECKING:
-    from experiments.recommend_validation import Config
+    from experiments.pictures import LEVELS
+from experiments.recommend_validation import Config
 
 LEAD = (
     "On volumes whose truth is known, what filterlab recommend says is set against it: the interval of the error of "
@@ -43,6 +45,12 @@ PICTURED_WORDS = {
     "sure": "the same: no interval holds the budget (not undecided)",
     "elsewhere": "where something does: nothing does over the region",
 }
+SHOWN = {
+    "volume": "Such a level lies anywhere, and often in what is nearly even: less is wrong there than over the region, "
+    "of which refusals speak.",
+    "detail": "Such a level lies where the signal changes: there more is wrong than over the region, of which picks "
+    "speak.",
+}
 TITLES = (
     "interval holds",
     "budget kept",
@@ -63,7 +71,7 @@ def draw(config: Config, records: Mapping[str, Record], _folder: Path) -> Sectio
     if volumes:
         blocks = [
             _verdict(volumes),
-            *(_in_pictures(volumes, task) for task in ("dvr", "isosurface")),
+            *(_in_pictures(volumes, task, level) for task in ("dvr", "isosurface") for level in LEVELS),
             _groups(reporting, "Reporting half, by kind of volume.", lambda r, _: r["class"]),
             _groups(reporting, "Reporting half, by boundary.", lambda _, found: found["boundary"]),
             _groups(reporting, "Reporting half, by task.", None),
@@ -156,9 +164,13 @@ def _met(held: Sequence[bool], bar: float | None) -> str:
     return "" if bar is None or not held else "met" if sum(held) >= bar * len(held) else "MISSED"
 
 
-def _in_pictures(volumes: Sequence[Record], task: str) -> Table:
-    """Both kinds of budgets in both halves."""
-    kinds = {(half, near): pictured(_answers(volumes, half, task, near)) for half in HALVES for near in (False, True)}
+def _in_pictures(volumes: Sequence[Record], task: str, level: str) -> Table:
+    """Both kinds of budgets in both halves, of pictures whose levels are drawn so."""
+    kinds = {
+        (half, near): pictured(_pictured_answers(volumes, half, task, level, near))
+        for half in HALVES
+        for near in (False, True)
+    }
     columns = [Column("", numeric=False), Column("asked for")]
     columns += [Column(f"{half}, {'near true errors' if near else 'as people ask'}") for half, near in kinds]
     rows = [
@@ -171,17 +183,16 @@ def _in_pictures(volumes: Sequence[Record], task: str) -> Table:
         for (name, words), bar in zip(PICTURED_WORDS.items(), PICTURED_BARS.values(), strict=True)
         if name != "rendered" or task == "dvr"
     ]
-    caption = (
-        f"Judged by what a picture shows, task {task}. A refusal speaks of the root mean square over the region; a "
-        "picture sees a part of it, and where that is an even one, something may do. The last column judges the "
-        "reporting half, budgets as people ask."
-    )
+    caption = f"Task {task}, by what pictures show of levels drawn by {level}. {SHOWN[level]}"
     return Table([*columns, Column("")], rows, caption)
 
 
-def _answers(volumes: Sequence[Record], half: str, task: str, near: bool) -> list[Mapping[str, Any]]:
+def _pictured_answers(
+    volumes: Sequence[Record], half: str, task: str, level: str, near: bool
+) -> list[Mapping[str, Any]]:
+    asked = {"task": task, "level": level, "near": near}
     found = [found for record in volumes if record["half"] == half for found in record["boundaries"]]
-    return [a for f in found for a in f["answers"] if a["task"] == task and a["near"] == near]
+    return [a for f in found for a in f["answers"] if asked.items() <= a.items()]
 
 
 def _groups(volumes: Sequence[Record], caption: str, key: Callable[[Record, Any], str] | None) -> Table:

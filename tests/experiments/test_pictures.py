@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import filterlab as fl
-from experiments.pictures import Cloud, Picture, drawn, medium, shown_by
+from experiments.pictures import Cloud, Picture, drawn, level_of, medium, shown_by
 from experiments.variety import Subject
 from filterlab.recommendation.choice import STEPS
 from filterlab.render import TransferFunction, render
@@ -53,7 +53,7 @@ def through(function: ValueAndGradient) -> Picture:
     xy = torch.cartesian_prod(across, across)
     origins = torch.cat((xy, torch.full((len(xy), 1), 0.35)), -1)
     directions = torch.tensor([0.0, 0.0, 15.3], dtype=torch.float64).expand(len(xy), 3)
-    return Picture(of_function(function), 1.0, 8.0, REGION, origins, directions)
+    return Picture(of_function(function), 1.0, 8.0, "volume", REGION, origins, directions)
 
 
 def constant(opacity: float) -> TransferFunction:
@@ -99,6 +99,21 @@ def test_a_picture_judges_what_its_rays_hit() -> None:
     nearest = picture.error(fl.reconstruct(subject.volume, "nearest"))
     assert nearest is not None
     assert nearest > 1  # its surface lies between voxels, and it has no gradient
+
+
+def test_levels_are_drawn_by_volume_or_by_detail() -> None:
+    """An edge in the plane z = 8: half of the volume is on each side, all of its detail is between."""
+
+    def edge(p: Tensor) -> tuple[Tensor, Tensor]:
+        t = torch.tanh(p[..., 2] - 8)
+        return t, (1 - t * t)[..., None] * p.new_tensor([0.0, 0.0, 1.0])
+
+    subject = subject_of(edge, np.random.default_rng(3))
+    for part in (0.25, 0.75):
+        z = 16 * part  # points are in 0 … 16
+        assert level_of(subject, "volume", part) == pytest.approx(math.tanh(z - 8), abs=0.001)
+        assert level_of(subject, "detail", part) == pytest.approx(2 * part - 1, abs=0.08)  # of 4096 points
+    assert level_of(subject, "volume", 1.0) < 1
 
 
 # --- of a medium ------------------------------------------------------------------------------------------------------
