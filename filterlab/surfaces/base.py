@@ -57,6 +57,11 @@ class Hits:
         """(...) bool."""
         return self.t.detach() < torch.inf
 
+    def places(self) -> Tensor:
+        """(M,) int64, the flat places in t of rays that hit, ascending; `valid` need not be made for it."""
+        t = self.t.detach()
+        return torch.from_numpy(np.flatnonzero(t.numpy() < np.inf)) if t.device.type == "cpu" else _where(self.valid)
+
     def where(self, kept: Tensor) -> Hits:
         """Those of a mask that broadcasts to (...), none elsewhere."""
         piece = None if self.piece is None else torch.where(kept, self.piece, -1)
@@ -224,7 +229,7 @@ class Surface(ABC):
             raise ValueError(f"hits of rays {tuple(rays)} have t of that shape, or (..., k); got {tuple(shape)}")
         if self.in_pieces and hit.piece is None:
             raise ValueError(f"hits of {type(self).__name__} tell which piece is hit; got hits with piece=None")
-        index = _where(hit.valid)
+        index = hit.places()
         if order == 1 and self._is_plain(origins, directions, hit):
             found = self._at_once(origins, directions, hit, index)
             if found is not None:
@@ -234,18 +239,19 @@ class Surface(ABC):
         return SurfacePoints(*spread([row for row in rows if row is not None], index, shape))
 
     def _is_plain(self, origins: Tensor, directions: Tensor, hit: Hits) -> bool:
-        """Whether points are on the rays, gradients those of the jet, and no derivative is asked."""
+        """Whether no derivative is asked."""
         if not origins.numel() or not plain(origins, directions, hit.t):
             return False
-        asked = torch.is_grad_enabled() and self._asked(origins, directions)
-        return not asked and not self._far_from(origins)
+        return not torch.is_grad_enabled() or not self._asked(origins, directions)
 
     def _at_once(self, origins: Tensor, directions: Tensor, hit: Hits, index: Tensor) -> SurfacePoints | None:
         """What is known up to order 1, of rows of hits that are made, and brought to the rays, in one pass each.
 
-        None: some gradient is not known, beside what is missing.
+        None: some ray begins far away, or some gradient is not known, beside what is missing.
         """
-        point = hit_points.points(origins, directions, hit.t, index)
+        point, far = hit_points.points(origins, directions, hit.t, index, self._reach)
+        if far:
+            return None
         piece = None if hit.piece is None else hit.piece.flatten().index_select(0, index)
         found = hit_points.by_rays(index, hit.t.shape, point, self.jet(point, 1, piece)[1])
         return None if found.unknown else SurfacePoints(*found[:3])
@@ -298,7 +304,7 @@ class Surface(ABC):
         """The same hits, with derivatives."""
         if not torch.is_grad_enabled() or not (transforming() or self._asked(origins, directions)):
             return hit
-        index = _where(hit.valid)
+        index = hit.places()
         if not len(index) or not self._follows(index[:1], hit, origins, directions):
             return hit
         o, d = chosen(index, hit.t.shape, origins, directions)

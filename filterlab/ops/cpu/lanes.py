@@ -394,6 +394,10 @@ class Lanes:
             product = self.builder.mul(product, factor)
         return product
 
+    def given(self, address: Value) -> Value:
+        """Whether an address is that of anything."""
+        return self.builder.icmp_unsigned("!=", self.builder.ptrtoint(address, I64), I64(0))
+
     def opaque(self, a: Value) -> Value:
         """The same integer, as if it came from nowhere: an empty piece of assembly that LLVM can't look into.
 
@@ -460,6 +464,7 @@ class Lanes:
     def reserve(self, element: ir.Type, count: int) -> Value:
         """Address of `count` elements on the stack; write this before any loop."""
         place = self.builder.alloca(element, count)
+        place.align = 64
         place.type = POINTER  # llvmlite still remembers what it points to; an address here is an address
         return place
 
