@@ -10,6 +10,7 @@ import torch
 
 from filterlab.ops.differentiable import height_hits as ops
 from filterlab.ops.raycast import Sheets
+from filterlab.ops.reference import height_hits as reference
 from filterlab.surfaces import HeightField
 from tests import laws
 from tests.height_ray_oracle import NAMES, STEPS, Ground, crossings
@@ -147,6 +148,20 @@ def test_a_picture_has_no_cracks(name):
     seen = ((inner > 0) & (inner < 45)).all(-1)
     assert bool((surface.hit(eye, aim - eye).t < torch.inf)[seen].all())
     assert bool((surface.hit(eye.float(), (aim - eye).float()).t < torch.inf)[seen].all())
+
+
+@pytest.mark.parametrize("name", ["linear", "c0", "c2"])
+def test_a_ray_leaves_cells_for_blocks_again(name, monkeypatch):
+    """Past the foot of a hill, over a plain of 480 data: not cell by cell, whatever the smallest blocks are."""
+    heights = torch.zeros(501, 501, dtype=F64)
+    heights[240:260, 10:20] = 1.0
+    heights[240:260, 480:490] = 1.0
+    steps, relevant = [], reference._relevant
+    monkeypatch.setattr(reference, "_relevant", lambda *given: steps.append(given) or relevant(*given))
+    o, d = torch.tensor([[19.5, 250.3, 0.9]], dtype=F64), torch.tensor([[1.0, 0.01, 0.0]], dtype=F64)
+    t = ops.first(HeightField(heights, name).cast, o, d, "reference")
+    assert 450 < float(t) < 475
+    assert len(steps) < 90
 
 
 @pytest.mark.parametrize("name", ["linear", "c1"])
