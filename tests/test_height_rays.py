@@ -89,19 +89,19 @@ def test_the_program_finds_what_plain_torch_finds(kind):
     assert int((ones != others).sum()) <= (0.2 * 200 if kind in ("at heights of vertices", "stairs") else 4)
 
 
-@every_kind
+@pytest.mark.parametrize("kind", ["horizontal", "vertical", "at heights of vertices", "stairs", "holes"])
 def test_the_program_finds_the_sheets_that_plain_torch_finds(kind):
     """As many, in the same places, in the same order, however many are asked for; the first one is the first hit."""
-    name = NAMES[(list(CLASSES).index(kind) + 1) % len(NAMES)]
+    name = NAMES[list(CLASSES).index(kind) % len(NAMES)]
     boundary, diagonal, seed = turn(name, kind)
     case, rng = case_of(name, kind, boundary, diagonal, seed)
-    rays = [torch.from_numpy(x) for x in CLASSES[kind][1](rng, case, 130)]
+    rays = [torch.from_numpy(x) for x in CLASSES[kind][1](rng, case, 60)]
     given, extent = case.surface.cast, case.surface.domain.diagonal
     plain, fused = (ops.sheets(given, *rays, Sheets(40, False, extent), how) for how in ("reference", "cpu"))
     same = ((plain < torch.inf) == (fused < torch.inf)).all(1)
     apart = torch.where(plain == fused, 0, (plain - fused).abs())[same].amax(1) * rays[1][same].norm(dim=1)
-    touching = 20 if kind == "at heights of vertices" else 2  # rays that touch within rounding
-    assert int((~same).sum()) + int((apart > (1e-6 if kind == "from far away" else 1e-9)).sum()) <= touching
+    touching = 10 if kind == "at heights of vertices" else 2  # rays that touch within rounding
+    assert int((~same).sum()) + int((apart > 1e-9).sum()) <= touching
     assert bool((fused[:, -1] == torch.inf).all())
     assert torch.equal(fused[:, 0], ops.first(given, *rays, "cpu"))
     last = [torch.cat((t[t < torch.inf].flip(0), t[t == torch.inf])) for t in fused]
@@ -113,11 +113,11 @@ def test_the_program_finds_the_sheets_that_plain_torch_finds(kind):
 
 def test_sheets_of_float32_rays_on_threads_are_those_of_each_ray_alone(monkeypatch):
     case, rng = case_of("c1", "horizontal", "mirror", "main", 5)
-    o, d = (torch.from_numpy(x).float() for x in CLASSES["horizontal"][1](rng, case, 67))
+    o, d = (torch.from_numpy(x).float() for x in CLASSES["horizontal"][1](rng, case, 23))
     given, asked = case.surface.cast, Sheets(3, False, 40.0)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     found = ops.sheets(given, o, d, asked, "cpu")
-    assert int((found < torch.inf).sum()) > 67
+    assert int((found < torch.inf).sum()) > 23
     alone = [ops.sheets(given, *rays, asked, "cpu") for rays in zip(o.split(1), d.split(1), strict=True)]
     assert torch.equal(found, torch.cat(alone))
     assert torch.equal(found, ops.sheets(given, o.double(), d.double(), asked, "cpu"))
