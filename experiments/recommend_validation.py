@@ -7,8 +7,15 @@ against the true error over the region that is promised; and for every task and 
     a pick          its true error must not exceed the budget, nor its cost 1.5 × that of the cheapest that meets it
     a refusal       nothing that was considered may truly meet the budget
 
-For isosurfaces the same is judged by pictures too: of a level of the signal, seen from anywhere, true errors are those
-of value and gradient where rays hit the surface that a method makes of the volume.
+For isosurfaces and dvr the same is judged by pictures too, seen from anywhere:
+
+    isosurface      of a level: errors of value and gradient where rays hit the surface that a method makes
+    dvr             of a translucent medium: errors of value and gradient where a march samples, and what it loses over
+                    its segments, all weighted by what the picture of the true signal shows of each segment
+
+Levels are drawn by volume or by detail, see `pictures`. A pixel of a medium is a mean along its ray, in which errors
+cancel: it can be right where what it shows is wrong, and so refutes no refusal. Of a pick the rendered picture is set
+beside that of the signal all the same.
 
 Budgets are drawn log-uniform, half of them between 0.01 % and 10 %, as people ask; the other half from a quarter of the
 least true error to four times the largest, where answers are hardest. Costs are measured once, on one volume, and
@@ -28,23 +35,19 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor
 
 import filterlab as fl
 from experiments.config import ExperimentConfig, VolumeChoice, number
 from experiments.members import seed_of
+from experiments.pictures import NO_PICTURES, Pictures
 from experiments.runs import Record, Run, Unit
 from experiments.variety import CLASSES, Subject, of_class, of_scan, size_of
 from filterlab.methods import METHODS
 from filterlab.recommendation.calibration import CALIBRATION, FALLS
 from filterlab.recommendation.choice import TASKS, Candidate, Question, Recommendation, choose, errors_of
 from filterlab.recommendation.errors import SURE, MethodErrors, Yardstick
-from filterlab.recommendation.survey import inner_box
 from filterlab.recommendation.ways import Way, WayCost, costs_of, ways_of
-from filterlab.render.rays import slab
 from filterlab.scenes.model import MethodName
-from filterlab.signals import Signal
-from filterlab.surfaces import LevelSet
 from filterlab.volume import Boundary, as_volume
 
 Size = Annotated[int, Field(ge=2, le=160)]
@@ -55,9 +58,6 @@ _BUDGETS = 1e-4, 0.1
 _AROUND = 4.0  # times the true errors
 _COUNTS, _HELD, _LIKELY = 0.05, 0.97, 0.85  # see `filterlab.recommendation.calibration`
 _COSTS_ON = 64  # voxels along an axis
-_PIXELS = 40  # along an edge of a picture
-_LEVELS = 0.2, 0.8  # parts of the region that may be below a level
-_FEW = 100  # hits that say nothing
 
 
 class Config(ExperimentConfig):
@@ -166,73 +166,36 @@ class Truth:
     Attributes:
         value, gradient: of these, over the region that is promised.
         bend: the second derivative along lines.
-        seen: the greater of the errors of value and gradient in a picture; None: there is none, or few rays hit.
+        hit: the greater of the errors of value and gradient in a picture of a level; None: there is none, or few rays
+            hit.
+        marched: all that dvr counts in a picture of a medium, by step; None: there is none, or hardly anything is seen.
     """
 
     value: float
     gradient: float
     bend: float
-    seen: float | None = None
+    hit: float | None = None
+    marched: Mapping[float, float] | None = None
 
     def counted(self, task: str, step: float | None) -> float:
         """As the task counts it."""
         own = self.value if task == "resample" else max(self.value, self.gradient)
         return math.hypot(own, 0.0 if step is None else step**2 / 24 * self.bend)
 
+    def pictured(self, step: float | None) -> float | None:
+        """The same in a picture: of a medium at a step, of a level without; None: there is none."""
+        return self.hit if step is None else None if self.marched is None else self.marched[step]
 
-def truth_of(subject: Subject, boundary: Boundary, way: Way, span: float, picture: Picture | None = None) -> Truth:
+
+def truth_of(subject: Subject, boundary: Boundary, way: Way, span: float, pictures: Pictures = NO_PICTURES) -> Truth:
     """Of the field that a way makes of the volume."""
     field = fl.reconstruct(subject.volume, way[0], boundary=boundary, storage=way[2])
     value, gradient = field.value_and_gradient(subject.points)
     off = ((value.double() - subject.value) / span).square(), ((gradient.double() - subject.gradient) / span).square()
     bend = (subject.second_derivative / span).square()
     means = [float((subject.weights * x).sum()) for x in (off[0], off[1].sum(-1), bend)]
-    seen = None if picture is None else picture.error(field)
-    return Truth(*(math.sqrt(mean) for mean in means), seen=seen)
-
-
-@dataclass(frozen=True)
-class Picture:
-    """Parallel rays through the region that is promised, and a level that the true signal has there.
-
-    Attributes:
-        signal: the truth.
-        span: the range that errors are parts of.
-        level: of the surface.
-        origins, directions: (R, 3), where rays enter the region, and from there to where they leave it.
-    """
-
-    signal: Signal
-    span: float
-    level: float
-    origins: Tensor
-    directions: Tensor
-
-    @classmethod
-    def of(cls, subject: Subject, span: float, random: np.random.Generator) -> Picture:
-        """Seen from a direction drawn at random, as the level that a part of the region drawn at random is below."""
-        lower, upper = inner_box(subject.volume.shape)  # type: ignore[arg-type]
-        basis = torch.linalg.qr(torch.tensor(random.standard_normal((3, 3))))[0]
-        steps = torch.linspace(-0.5, 0.5, _PIXELS, dtype=torch.float64) * float((upper - lower).norm())
-        across = torch.cartesian_prod(steps, steps)
-        middle = (lower + upper) / 2 + across[:, :1] * basis[0] + across[:, 1:] * basis[1]
-        near, far = slab(middle, basis[2].expand_as(middle), lower.tolist(), upper.tolist())
-        o, d = middle + near[:, None] * basis[2], (far - near)[:, None] * basis[2]
-        rank = subject.value.argsort()
-        below = subject.weights[rank].cumsum(0) <= random.uniform(*_LEVELS)
-        level = float(subject.value[rank[int(below.sum())]])
-        return cls(subject.signal, span, level, o[near < far], d[near < far])
-
-    def error(self, field: fl.Field) -> float | None:
-        """As an isosurface counts it, of the hits that are seen; None: there are few."""
-        hit = LevelSet(field, self.level).hit(self.origins, self.directions)
-        seen = hit.t <= 1
-        if int(seen.sum()) < _FEW:
-            return None
-        point = self.origins[seen] + hit.t[seen][:, None] * self.directions[seen]
-        (_, own), (value, gradient) = field.value_and_gradient(point), self.signal.value_and_gradient(point)
-        off = (value - self.level).square().mean(), (gradient - own).square().sum(-1).mean()
-        return math.sqrt(float(max(off))) / self.span
+    hit, marched = pictures.errors(field)
+    return Truth(*(math.sqrt(mean) for mean in means), hit=hit, marched=marched)
 
 
 # --- judgement --------------------------------------------------------------------------------------------------------
@@ -248,11 +211,11 @@ def _judged(
     """Estimates and answers under a boundary."""
     yardstick = Yardstick.of(subject.volume[None], None, boundary, config.seed)
     errors = errors_of(yardstick, config.methods, subject.volume.dtype, lambda _: True)
-    picture = Picture.of(subject, yardstick.span, random.spawn(1)[0]) if subject.differentiable else None
+    pictures = Pictures.of(subject, yardstick.span, random)
     known: dict[tuple[str, str | None], Truth] = {}
     for way in errors:
         if (way[0], way[2]) not in known:  # schemes compute the same field
-            known[way[0], way[2]] = truth_of(subject, boundary, way, yardstick.span, picture)
+            known[way[0], way[2]] = truth_of(subject, boundary, way, yardstick.span, pictures)
     truths = {way: known[way[0], way[2]] for way in errors}
     return {
         "boundary": str(boundary),
@@ -260,7 +223,7 @@ def _judged(
         "doubts": dict(yardstick.doubts),
         "bend": [yardstick.bend, next(iter(truths.values())).bend],
         "ways": list(_compared(yardstick, errors, truths)),
-        "answers": list(_answers(config, subject, yardstick, errors, truths, costs, random)),
+        "answers": list(_answers(config, subject, yardstick, errors, truths, costs, pictures, random)),
     }
 
 
@@ -289,22 +252,35 @@ def _answers(
     errors: Mapping[Way, MethodErrors],
     truths: Mapping[Way, Truth],
     costs: Mapping[tuple[Way, int], WayCost],
+    pictures: Pictures,
     random: np.random.Generator,
 ) -> Iterator[dict[str, Any]]:
     """For every task and budget."""
     volume = as_volume(subject.volume)
     for task in TASKS if subject.differentiable else TASKS[:1]:
         taken = _carried_over(costs, task, subject.volume.numel())
-        pictured = task == "isosurface" and all(t.seen is not None for way, t in truths.items() if way[0] != "nearest")
         for near, budget in _budgets(config, task, truths, random):
             question = Question(task, budget, math.inf, math.inf, str(yardstick.boundary), "refuse")
             answer = choose(question, volume, yardstick, errors, taken)
             found = {"near": near, **judged(answer, partial(_true, task, truths))}
-            yield found | ({"pictured": judged(answer, partial(_seen, truths))} if pictured else {})
+            yield found | _by_pictures(answer, subject, truths, pictures)
+
+
+def _by_pictures(
+    answer: Recommendation, subject: Subject, truths: Mapping[Way, Truth], pictures: Pictures
+) -> dict[str, Any]:
+    """The answer judged by pictures, and the picture of a pick beside the true one; nothing where there are none."""
+    seen = [t.pictured(answer.best.step) for way, t in truths.items() if way[0] != "nearest"]  # it has few levels
+    if pictures.picture is None or answer.task == "resample" or None in seen:
+        return {}
+    found = {"level": pictures.picture.drawn_by, "pictured": judged(answer, partial(_seen, truths))}
+    if answer.pick is None or answer.pick.step is None or pictures.cloud is None:
+        return found
+    return found | {"rendered": number(pictures.cloud.rendered(answer.field(subject.volume), answer.pick.step))}
 
 
 def _seen(truths: Mapping[Way, Truth], candidate: Candidate) -> float:
-    seen = truths[candidate.method, candidate.scheme, candidate.storage].seen
+    seen = truths[candidate.method, candidate.scheme, candidate.storage].pictured(candidate.step)
     return math.inf if seen is None else seen
 
 

@@ -321,8 +321,7 @@ def of_class(name: str, size: tuple[int, int, int], points: int, random: np.rand
     """A member of a class."""
     n = torch.tensor(size[::-1], dtype=torch.float64)
     drawn = CLASSES[name](Draw(random, n))
-    upper = (float(n[0]) - 0.5, float(n[1]) - 0.5, float(n[2]) - 0.5)
-    signal = Signal(name, _chunked(drawn.function), (-0.5, -0.5, -0.5), upper)
+    signal = _truth(name, _chunked(drawn.function), size)
     volume = drawn.samples(signal.sample([int(k) for k in n], dtype=torch.float64).samples)
     at, weights = _points(size, points, drawn.foci, random)
     return _subject(drawn.label, volume, signal, at, weights, random, drawn.differentiable)
@@ -350,7 +349,14 @@ def of_scan(scan: Tensor, aliased: bool, largest: int, points: int, random: np.r
 
     d, h, w = coarse.shape
     at, weights = _points((d, h, w), points, (), random)
-    return _subject("", coarse.contiguous().float(), Signal("scan", function), at, weights, random, True)
+    signal = _truth("scan", _chunked(function), (d, h, w))
+    return _subject("", coarse.contiguous().float(), signal, at, weights, random, True)
+
+
+def _truth(name: str, function: ValueAndGradient, size: tuple[int, int, int]) -> Signal:
+    """A signal in the box of voxels of length 1 whose centres are the integers, z, y, x of them."""
+    d, h, w = size
+    return Signal(name, function, (-0.5, -0.5, -0.5), (w - 0.5, h - 0.5, d - 0.5), 1.0)
 
 
 def _subject(

@@ -7,16 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from torch import Tensor
 
-import filterlab as fl
-from experiments.recommend_validation import HALVES, Picture, Truth, fitted, judged
-from experiments.report.recommend_validation import BARS, _met, _verdict, outcomes
-from experiments.variety import Subject
+from experiments.recommend_validation import HALVES, Truth, fitted, judged
+from experiments.report.recommend_validation import BARS, _met, _verdict, outcomes, pictured
 from filterlab.recommendation import Candidate, ErrorEstimate, Recommendation
 from filterlab.recommendation.calibration import CALIBRATION, FALLS
-from filterlab.signals import Signal, ValueAndGradient
 
 
 def candidate(method: str, seconds: float, low: float, high: float) -> Candidate:
@@ -76,43 +71,12 @@ def test_truths_are_counted_as_the_task_counts() -> None:
     assert truth.counted("dvr", 0.5) == pytest.approx(math.hypot(0.03, 0.25 / 24 * 2.4))
 
 
-def of_function(function: ValueAndGradient, n: int, random: np.random.Generator) -> Subject:
-    """A volume of n³ exact samples, known at random points."""
-    signal = Signal("known", function)
-    points = torch.tensor(random.random((4096, 3))) * (n - 1)
-    value, gradient = signal.value_and_gradient(points)
-    weights = torch.full((4096,), 1 / 4096, dtype=torch.float64)
-    grid = torch.stack(torch.meshgrid(*[torch.arange(float(n), dtype=torch.float64)] * 3, indexing="ij"), -1).flip(-1)
-    volume = signal.value_and_gradient(grid)[0]
-    return Subject("known", volume, points, weights, value, gradient, torch.zeros(4096), signal)
-
-
-def test_a_picture_judges_what_its_rays_hit() -> None:
-    """A ball of radius 4 in the middle, exact, and 2 % too small."""
-    center, n = torch.tensor([8.0, 8.0, 8.0], dtype=torch.float64), 17
-
-    def ball(p: Tensor) -> tuple[Tensor, Tensor]:
-        away = p - center
-        return away.square().sum(-1), 2 * away
-
-    random = np.random.default_rng(3)
-    subject = of_function(ball, n, random)
-    picture = replace(Picture.of(subject, 1.0, random), level=16.0)
-    assert (picture.directions.norm(dim=-1) > 0).all()
-    ends = torch.stack([picture.origins, picture.origins + picture.directions])
-    assert ends.min() >= 0.35 - 1e-9  # the region: 0.9 of −½ … 16½
-    assert ends.max() <= 15.65 + 1e-9
-    exact = fl.reconstruct(subject.volume, "catmull-rom")
-    found = picture.error(exact)
-    assert found is not None
-    assert found < 1e-10  # of a quadratic
-    off = fl.reconstruct(subject.volume * 0.98, "catmull-rom")
-    # hits at |p − c|² = 16 / 0.98: value off by 0.02 · 16 / 0.98, gradient by 0.02 · 2 · 4 / √0.98
-    assert picture.error(off) == pytest.approx(max(0.32 / 0.98, 0.16 / math.sqrt(0.98)), rel=1e-4)
-    assert replace(picture, level=-1.0).error(exact) is None
-    nearest = picture.error(fl.reconstruct(subject.volume, "nearest"))
-    assert nearest is not None
-    assert nearest > 1  # its surface lies between voxels, and it has no gradient
+def test_truths_in_pictures() -> None:
+    """Of a level without a step, of a medium by the step of the march."""
+    truth = Truth(0.01, 0.03, 2.4, 0.05, {0.5: 0.04})
+    assert truth.pictured(None) == 0.05
+    assert truth.pictured(0.5) == 0.04
+    assert Truth(0.01, 0.03, 2.4).pictured(0.5) is None
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
@@ -157,24 +121,28 @@ def test_outcomes_of_a_volume() -> None:
         {"task": "dvr", "picked": False, "kept": None, "justified": True, "factor": None, "undecided": False},
         {"task": "dvr", "picked": False, "kept": None, "justified": False, "factor": None, "undecided": True},
     ]
-    pictured = {"kept": None, "justified": False}
-    seen = {"task": "isosurface", "picked": False, "justified": True, "undecided": False, "pictured": pictured}
-    seen_pick = {"task": "isosurface", "picked": True, "factor": None, "kept": False, "pictured": {"kept": True}}
-    answers = [{"near": i == 2, **a} for i, a in enumerate([*answers, seen, seen_pick])]
+    answers = [{"near": i == 2, **a} for i, a in enumerate(answers)]
     found = {"ways": [{**way, "resample": [0.4, 0.6], "isosurface": [0.0, 1.9]}], "answers": answers}
     counted = outcomes({"differentiable": True}, found)
     assert counted["holds"] == [True, False]
-    assert (counted["kept"], counted["near"]) == ([False, False], [False])
-    assert (counted["justified"], counted["hard"], counted["sure"]) == ([True, True], [False], [True, True])
-    assert counted["kept in pictures"] == [True]
-    assert counted["justified in pictures"] == counted["sure in pictures"] == [False]
+    assert (counted["kept"], counted["near"]) == ([False], [False])
+    assert (counted["justified"], counted["hard"], counted["sure"]) == ([True], [False], [True])
     assert outcomes({"differentiable": False}, found)["holds"] == [True]
     assert outcomes({"differentiable": True}, found, "isosurface")["holds"] == [False]
 
 
+def test_outcomes_in_pictures() -> None:
+    """Refusals that the region bears out and the picture does not are told apart; what has no picture is left out."""
+    pick = {"picked": True, "kept": False, "budget": 0.1, "rendered": 0.2, "pictured": {"kept": True}}
+    refused = {"picked": False, "justified": True, "undecided": False, "pictured": {"justified": False}}
+    doubtful = {"picked": False, "justified": False, "undecided": True, "pictured": {"justified": True}}
+    counted = pictured([pick, {**pick, "rendered": 0.1}, refused, doubtful, {"picked": True, "kept": False}])
+    assert (counted["kept"], counted["rendered"]) == ([True, True], [False, True])
+    assert (counted["justified"], counted["sure"], counted["elsewhere"]) == ([False, True], [False], [True])
+
+
 def test_rates_are_compared_with_what_was_asked() -> None:
-    known = {HALVES[1]: {name: [True] * 49 + [False] for name in BARS}}
-    assert _met(known, "kept") == "met"
-    known[HALVES[1]]["kept"] += [False]
-    assert _met(known, "kept") == "MISSED"
+    assert _met([True] * 49 + [False], 0.98) == "met"
+    assert _met([True] * 48 + [False], 0.98) == "MISSED"
+    assert _met([], 0.98) == _met([False], None) == ""
     assert [row[-1] for row in _verdict([]).rows] == [""] * len(BARS)
