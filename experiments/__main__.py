@@ -10,7 +10,7 @@ from experiments.errors import RunError
 from experiments.headings import known_configs
 from experiments.registry import heading_of
 from filterlab.cli.imports import importing
-from filterlab.cli.outcome import FAILED, OK, USAGE, UsageError
+from filterlab.cli.outcome import FAILED, OK, USAGE, UsageError, unread
 from filterlab.io.atomic import disk_is_full
 from filterlab.io.bounded import VolumeFileError
 from filterlab.io.config import ConfigError
@@ -50,6 +50,8 @@ def main(arguments: list[str] | None = None) -> int:
     except (ConfigError, UsageError) as error:
         print(f"error: {error}", file=sys.stderr)
         return USAGE
+    except BrokenPipeError:
+        return unread()
     except (RunError, VolumeFileError, OSError) as error:
         print(f"error: {_explained(error)}", file=sys.stderr)
         return FAILED
@@ -110,6 +112,7 @@ def _list() -> int:
     width = max(map(len, configs), default=0)
     for name, path in configs.items():
         print(f"{name:<{width}}  {heading_of(path).description}")
+    sys.stdout.flush()
     return OK
 
 

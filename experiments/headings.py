@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from filterlab.io.config import ConfigError, Problem, load_config
+from filterlab.names import unknown_name
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
@@ -31,7 +32,7 @@ def config_path(name: str) -> Path:
     """The config file that `name` stands for: a path, or the bare name of a file in configs/.
 
     Raises:
-        ConfigError: neither; the message lists the known names.
+        ConfigError: neither; the message tells the nearest name, and lists the known ones.
     """
     path = Path(name)
     if path.is_file():
@@ -39,8 +40,8 @@ def config_path(name: str) -> Path:
     configs = known_configs()
     if name.removesuffix(".yaml") in configs:
         return configs[name.removesuffix(".yaml")]
-    message = f"expected the path of a YAML file or one of the known configs: {', '.join(configs)}"
-    raise ConfigError([Problem(name, "", f"{message}; found neither")])
+    message = f"expected the path of a YAML file, or a config's name; {unknown_name('config', name, configs)}"
+    raise ConfigError([Problem(name, "", message)])
 
 
 class Heading(BaseModel):

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from filterlab.ops.differentiable import height_hits as ops
+from filterlab.ops.raycast import Sheets
 from filterlab.surfaces import HeightField
 from tests import laws
 from tests.height_ray_oracle import NAMES, STEPS, Ground, crossings
@@ -85,6 +86,53 @@ def test_the_program_finds_what_plain_torch_finds(kind):
     assert torch.equal(ops.met(given, *rays, "cpu"), fused < torch.inf)
     ones, others = (ops.candidates(given, *rays, how).ray.bincount(minlength=200) for how in ("reference", "cpu"))
     assert int((ones != others).sum()) <= (0.2 * 200 if kind in ("at heights of vertices", "stairs") else 4)
+
+
+@every_kind
+def test_the_program_finds_the_sheets_that_plain_torch_finds(kind):
+    """As many, in the same places, in the same order, however many are asked for; the first one is the first hit."""
+    name = NAMES[(list(CLASSES).index(kind) + 1) % len(NAMES)]
+    boundary, diagonal, seed = turn(name, kind)
+    case, rng = case_of(name, kind, boundary, diagonal, seed)
+    rays = [torch.from_numpy(x) for x in CLASSES[kind][1](rng, case, 130)]
+    given, extent = case.surface.cast, case.surface.domain.diagonal
+    plain, fused = (ops.sheets(given, *rays, Sheets(40, False, extent), how) for how in ("reference", "cpu"))
+    same = ((plain < torch.inf) == (fused < torch.inf)).all(1)
+    apart = torch.where(plain == fused, 0, (plain - fused).abs())[same].amax(1) * rays[1][same].norm(dim=1)
+    touching = 20 if kind == "at heights of vertices" else 2  # rays that touch within rounding
+    assert int((~same).sum()) + int((apart > (1e-6 if kind == "from far away" else 1e-9)).sum()) <= touching
+    assert bool((fused[:, -1] == torch.inf).all())
+    assert torch.equal(fused[:, 0], ops.first(given, *rays, "cpu"))
+    last = [torch.cat((t[t < torch.inf].flip(0), t[t == torch.inf])) for t in fused]
+    for count in (1, 2, 5):
+        near, far = (ops.sheets(given, *rays, Sheets(count, way, extent), "cpu") for way in (False, True))
+        assert torch.equal(near, fused[:, :count])
+        assert torch.equal(far, torch.stack(last)[:, :count])
+
+
+def test_sheets_of_float32_rays_on_threads_are_those_of_each_ray_alone(monkeypatch):
+    case, rng = case_of("c1", "horizontal", "mirror", "main", 5)
+    o, d = (torch.from_numpy(x).float() for x in CLASSES["horizontal"][1](rng, case, 67))
+    given, asked = case.surface.cast, Sheets(3, False, 40.0)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    found = ops.sheets(given, o, d, asked, "cpu")
+    assert int((found < torch.inf).sum()) > 67
+    alone = [ops.sheets(given, *rays, asked, "cpu") for rays in zip(o.split(1), d.split(1), strict=True)]
+    assert torch.equal(found, torch.cat(alone))
+    assert torch.equal(found, ops.sheets(given, o.double(), d.double(), asked, "cpu"))
+
+
+def test_hits_that_rounding_alone_has_apart_are_one():
+    """It is taken for so large here that those 0.7 apart are one, those 1.3 apart are not."""
+    ridges = HeightField(torch.tensor([0.0, 1.0] * 5, dtype=F64).expand(6, -1).clone(), "linear")
+    o, d = torch.tensor([[-1.0, 2.3, 0.35]], dtype=F64), torch.tensor([[1.0, 0, 0]], dtype=F64)
+    every = ops.sheets(ridges.cast, o, d, Sheets(12, False, 10.0), "cpu")
+    expected = 1.35 + torch.tensor([0, 1.3, 2, 3.3, 4, 5.3, 6, 7.3, 8], dtype=F64)
+    assert torch.allclose(every[0, :9], expected, rtol=0, atol=1e-12)
+    for how in ("cpu", "reference"):
+        found = ops.sheets(ridges.cast, o, d, Sheets(12, False, 1 / (32 * 2.0**-52)), how)
+        assert torch.allclose(found[0, :5], expected[[0, 1, 3, 5, 7]], rtol=0, atol=1e-12)
+        assert bool((found[0, 5:] == torch.inf).all())
 
 
 @every_spline

@@ -14,10 +14,11 @@ from filterlab.fields.base import Field
 from filterlab.fields.tensor_product import SAMPLERS, exact_sample
 from filterlab.kernels import bc
 from filterlab.methods import METHODS, reconstruct
+from filterlab.ops import Evaluation
 from filterlab.ops.cpu import compiler
 from filterlab.ops.differentiable.gather import IMPLEMENTATIONS
 from filterlab.scenes.model import Reconstruction
-from filterlab.volume import Boundary
+from filterlab.volume import Boundary, Volume
 from tests import laws, oracles
 from tests.test_methods import TENSOR_PRODUCTS
 
@@ -267,6 +268,34 @@ def frames_since(name: str) -> int:
             names.append(frame.f_code.co_name)
         frame = frame.f_back
     return names.index(name) + 1 if name in names else 0
+
+
+TURNED = torch.tensor([[1.0, 0.2, 0.1, 3.0], [0.3, 1.2, -0.2, -2.0], [-0.1, 0.4, 0.9, 5.0], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize("method", ["triquadratic", "qss"])
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+@pytest.mark.parametrize("affine", [None, torch.diag(torch.tensor([0.7, -1.1, 2.0, 1])), TURNED], ids=range(3))
+def test_jets_in_one_pass_are_those_of_rows(method, batch, affine):
+    samples = torch.as_tensor(np.random.default_rng(0).uniform(-1, 1, (*batch, *SHAPE)), dtype=torch.float32)
+    within, beyond = 0.9 * points(700, 0.0).float(), points(333).float()  # some of many blocks are turned
+    for boundary in ("mirror", "wrap", "border"):
+        field = reconstruct(Volume(samples, affine=affine), method, boundary=boundary)
+        for voxels in (within[:1], within, torch.cat([within, beyond])):
+            x = field.domain.geometry.to_world(voxels)
+            x = x.expand(*batch[:1], *x.shape)
+            rows = field.jet(x.clone().requires_grad_(), 1)
+            for own, other in zip(field.jet(x, 1), rows, strict=True):
+                assert torch.equal(own, other.detach())
+
+
+def test_a_jet_asks_for_rows_only_where_it_must(monkeypatch):
+    field = reconstruct(volume().float(), "triquadratic")
+    x = points(50).float()
+    monkeypatch.setattr(Evaluation, "__call__", lambda *_: pytest.fail("rows were asked for"))
+    field.jet(x, 1)
+    with pytest.raises(pytest.fail.Exception, match="rows"):
+        field.jet(x.requires_grad_(), 1)
 
 
 def test_a_former_name_of_the_sampled_scheme_is_understood() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import filterlab as fl
-from filterlab.render import Light, PerspectiveCamera, Phong, TransferFunction, render
+from filterlab.render import Light, PerspectiveCamera, Phong, TransferFunction, raycast, render
 from filterlab.surfaces import HeightField, LevelSet, Quadrics, fit_slim, mesh
 
 points = torch.zeros(5, 3)
@@ -43,6 +43,8 @@ reveal_type(fl.load_heights("dem.tif"))  # Heights
 reveal_type(fit_slim(points))  # Slim
 reveal_type(camera)  # PerspectiveCamera
 reveal_type(render(field, camera, TransferFunction.suggested(field), size=(4, 4)))  # Tensor
+reveal_type(raycast(surface, camera, size=(4, 4))[..., :3])  # Tensor
+reveal_type(raycast(surface, camera, channels=("depth", "normal")))  # dict[str, Tensor]
 reveal_type(Phong((1, 1, 1)))  # Phong
 reveal_type(Light(None))  # Light
 reveal_type(fl.io.load_image("picture.png"))  # Tensor

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 import shutil
 import sys
 import textwrap
@@ -14,7 +13,17 @@ from importlib import import_module
 from typing import Any
 
 from filterlab.cli.imports import importing
-from filterlab.cli.outcome import FAILED, INTERRUPTED, OK, USAGE, UsageError, message_of, out_of_memory, shortage
+from filterlab.cli.outcome import (
+    FAILED,
+    INTERRUPTED,
+    OK,
+    USAGE,
+    UsageError,
+    message_of,
+    out_of_memory,
+    shortage,
+    unread,
+)
 from filterlab.cli.terminal import tell
 from filterlab.names import unknown_name
 from filterlab.notices import Notice
@@ -54,15 +63,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             kind = kind_of(_command(arguments[0]))
         arguments, overrides = _split(kind, arguments)
         with _warnings_told():
-            return _parse(kind, arguments).run(overrides) or OK
+            code = _parse(kind, arguments).run(overrides) or OK
+            sys.stdout.flush()
+            return code
     except SystemExit as exit:  # tyro: --help, or usage
         return exit.code if isinstance(exit.code, int) else USAGE
     except UsageError as error:
         tell(f"{error} (see filterlab {arguments[0]} --help)")
         return USAGE
-    except BrokenPipeError:  # the reader of our output has gone, as in `filterlab methods | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
+    except BrokenPipeError:
+        return unread()
     except (ValueError, OSError) as error:
         tell(message_of(error))
         return FAILED

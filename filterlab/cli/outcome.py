@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 
 OK, FAILED, USAGE, NOTHING_FITS, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 class UsageError(ValueError):
     """A command line that makes no sense: exit code 2."""
+
+
+def unread() -> int:
+    """How a command ends, quietly, whose output nobody reads any more, as in `filterlab methods | head -1`."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return FAILED
 
 
 def message_of(error: ValueError | OSError) -> str:

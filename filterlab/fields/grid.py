@@ -7,10 +7,10 @@ of gradients flipped where a reflection turned an axis round, and every boundary
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -26,13 +26,16 @@ from filterlab.ops.differentiable import raycast as casting
 from filterlab.ops.differentiable.drivers import room_of
 from filterlab.ops.differentiable.prefilter import implementation_for
 from filterlab.ops.pieces import Lattice, Pieces
-from filterlab.ops.place import Placement
+from filterlab.ops.place import InWorld, Placement
 from filterlab.ops.prefilter import VOLUME
 from filterlab.ops.raycast import Candidates, Raycast
 from filterlab.ops.reference.pieces import in_cells, pieces_of_rays
 from filterlab.ops.stencil import Product, Stencil
+from filterlab.ops.tetrahedra import AnyLattice
 from filterlab.prefilters import Prefilter
 from filterlab.volume import Boundary, Volume
+
+_Cells = TypeVar("_Cells", bound=AnyLattice)
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,13 @@ class Evaluation(Protocol):
     def __call__(self, points: Tensor) -> tuple[Tensor, Tensor | None]:
         """World points (N, M, 3) -> (N, C, J, M), rows as in `multi_indices(order)`, before points were turned; sign of
         `ops.place`, or None."""
+        ...
+
+    def in_world(self, points: Tensor, shape: Sequence[int]) -> InWorld | None:
+        """Of a jet of order 1: value, of N C M numbers in the shape asked for, and gradient per world unit (*shape, 3).
+
+        None: it has no faster way to them than by rows, or derivatives are asked.
+        """
         ...
 
     def of(self, coefficients: Tensor) -> Evaluation:
@@ -256,6 +266,7 @@ class GridField(Field):
     """
 
     scheme: Scheme
+    _lattice: Any  # once it was asked for
 
     def __init__(self, method: str, volume: Volume, coefficients: Coefficients, scheme: Scheme) -> None:
         self.method = method
@@ -268,6 +279,7 @@ class GridField(Field):
 
     def _settle(self) -> None:
         """Decide everything that points don't: for points of every entry, and for points that all entries share."""
+        self._lattice = None
         own, shared = self._batched()
         self._own = self._evaluations(own)
         self._shared = self._own if shared is None else self._evaluations(shared)
@@ -328,6 +340,7 @@ class GridField(Field):
 
     def _exchange(self) -> None:
         """Settle for other coefficients only: what does not depend on them is decided."""
+        self._lattice = None
         own, shared = self._batched()
         self._own = [evaluation.of(own) for evaluation in self._own]
         self._shared = self._own if shared is None else [evaluation.of(shared) for evaluation in self._shared]
@@ -360,7 +373,15 @@ class GridField(Field):
     @property
     def lattice(self) -> Lattice:
         """The cells on which this field is one polynomial each; of an unbatched field."""
-        return self.coefficients.lattice(self.scheme.terms)
+        return self._once(lambda: self.coefficients.lattice(self.scheme.terms))
+
+    def _once(self, lattice: Callable[[], _Cells]) -> _Cells:
+        """The lattice of these coefficients, made once; not where it is recorded, which changes from call to call."""
+        if self.requires_grad:
+            return lattice()
+        if self._lattice is None:
+            self._lattice = lattice()
+        return self._lattice
 
     def pieces_along(self, origins: Tensor, directions: Tensor, level: float | None = None) -> Pieces:
         self._check_pieces()
@@ -415,6 +436,10 @@ class GridField(Field):
             axis, shape = 2, points.shape[1:-1]
             flat = points.reshape(points.shape[0], math.prod(shape), 3)
             evaluations = self._own if len(flat) == self.channels[0] else self._shared
+        if order == 1 and self.coefficients.quantization is None:
+            found = evaluations[1].in_world(flat, (*(self.channels or ()), *shape))
+            if found is not None:
+                return found
         rows, sign = evaluations[order](flat)
         value, *others = self._decoded(rows, shape).split_with_sizes(_ROWS[: order + 1], axis)
         if sign is not None:

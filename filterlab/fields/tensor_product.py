@@ -246,6 +246,9 @@ class SampledEvaluation:
         own = values.view_as(values)  # derivatives of one call are summed on their own
         return self.scheme.jet(replace(self.coefficients, values=own), located, self.order), sign
 
+    def in_world(self, points: Tensor, shape: Sequence[int]) -> None:
+        """Only by rows."""
+
     def of(self, coefficients: Tensor) -> SampledEvaluation:
         return replace(self, coefficients=replace(self.coefficients, values=coefficients))
 

@@ -36,7 +36,7 @@ from filterlab.fields.grid import NO_AXIS, Axes, Coefficients, Evaluation, Term,
 from filterlab.fields.trends import Input, Piece, on_cubes, on_octahedra
 from filterlab.geometry import Geometry
 from filterlab.ops.differentiable.recording import plain, transformed
-from filterlab.ops.place import Placement
+from filterlab.ops.place import InWorld, Placement
 from filterlab.ops.reference.place import far_voxels
 from filterlab.ops.tetrahedra import Tetrahedra, TetrahedralStencil, Trend
 from filterlab.volume import Boundary, all_between
@@ -608,6 +608,9 @@ class FusedOnTetrahedra:
     def of(self, coefficients: Tensor) -> FusedOnTetrahedra:
         return FusedOnTetrahedra(self.near.of(coefficients), self.everywhere.of(coefficients))
 
+    def in_world(self, points: Tensor, shape: Sequence[int]) -> InWorld | None:
+        return self.near.in_world(points, shape, turned=False)
+
     def __call__(self, points: Tensor) -> tuple[Tensor, None]:
         if transformed():
             return self.everywhere(points)
@@ -635,6 +638,9 @@ class JetOnTetrahedra:
 
     def of(self, coefficients: Tensor) -> JetOnTetrahedra:
         return replace(self, values=coefficients)
+
+    def in_world(self, points: Tensor, shape: Sequence[int]) -> None:
+        """Only by rows."""
 
     def __call__(self, points: Tensor) -> tuple[Tensor, None]:
         n, m = points.shape[:2]

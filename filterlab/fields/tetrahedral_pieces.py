@@ -120,6 +120,9 @@ class FieldOnTetrahedra(GridField):
     @property
     def lattice(self) -> TetrahedralLattice:
         """The cubes about the samples; of an unbatched field, padded for programs."""
+        return self._once(self._cubes)
+
+    def _cubes(self) -> TetrahedralLattice:
         spline, values = self.scheme.spline.lowered, self.coefficients.values
         for dim, n, first in zip((-1, -2, -3), self.coefficients.size, self.coefficients.first, strict=True):
             values = values.narrow(dim, -int(first) - spline.around, n + 2 * spline.around)

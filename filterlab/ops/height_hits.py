@@ -5,7 +5,7 @@ box around all heights, with d so long that its largest component is 1.
 
     blocks    the least and greatest coefficient of every 2^l × 2^l cells, from single cells (or 4 × 4 of them) to all:
               where a ray stays above or below, a block is left out. Out of a block it goes to the next one of that
-              size, or of twice that size where that begins
+              size, or of twice that size where that begins; cells lie in the smallest blocks, nothing between
     cells     a ray crosses a cell, and its diagonal: two pieces at most
     pieces    on the ray's part from p to q of a triangle c_i = b[p, …, p, q, …, q], with q i times, minus the height of
               the ray, which is a line: its coefficients are z_p + i/4 (z_q − z_p)

@@ -111,6 +111,11 @@ class Pattern:
         return 1 if len(self.up.samples) == 3 else DEGREE
 
     @cached_property
+    def lines(self) -> int:
+        """In how many rows the data of a triangle lie."""
+        return len({b for _, b in self.offsets})
+
+    @cached_property
     def reach(self) -> int:
         """How many steps beyond a cell its data are."""
         return max(max(-a, -b, a - self.steps, b - self.steps) for a, b in self.offsets)

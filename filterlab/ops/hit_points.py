@@ -14,6 +14,18 @@ from typing import NamedTuple
 from torch import Tensor
 
 
+class OnRays(NamedTuple):
+    """Where rays hit.
+
+    Attributes:
+        point: (M, 3).
+        far: whether a component of the origin of any of these rays is beyond what was asked about.
+    """
+
+    point: Tensor
+    far: bool
+
+
 class ByRays(NamedTuple):
     """What is known at hits, by rays.
 

@@ -23,6 +23,9 @@ from filterlab.volume import Boundary
 Placed = tuple[Tensor, Tensor | None]
 """(located, sign), both of the shape of the points; sign None where it is 1 everywhere."""
 
+InWorld = tuple[Tensor, Tensor]
+"""(value, gradient per world unit) of points that were placed: what gather's rows say, their signs minded."""
+
 
 @dataclass(frozen=True)
 class Placement:

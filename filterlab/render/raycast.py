@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack, overload
 
 import torch
 from torch import Tensor
@@ -204,6 +204,43 @@ def _depth(origins: Tensor, directions: Tensor, at: SurfacePoints, hits: Hits) -
     """(R, 1): world distances along unit rays, ∞ where nothing is hit."""
     depth = dot(at.point[:, 0].double() - origins, directions)
     return torch.where(hits.valid[:, 0], depth, torch.inf).to(at.point)[:, None]
+
+
+class Options(TypedDict, total=False):
+    """Keywords of `raycast` that its result has the same type with."""
+
+    size: Sequence[int] | None
+    lights: Sequence[Light]
+    background: Sequence[float] | Tensor | Around
+    haze: Haze | None
+    water: Water | None
+    block: Block | None
+    region: Region | None
+    sheets: int
+    shadows: bool
+    subpixels: int
+    silhouettes: Silhouettes | None
+    seed: int
+    dtype: torch.dtype
+    device: torch.device | str | None
+    progress: Progress
+
+
+@overload
+def raycast(
+    surface: Surface, camera: View, material: Material | None = ..., *, channels: None = ..., **options: Unpack[Options]
+) -> Tensor: ...
+
+
+@overload
+def raycast(
+    surface: Surface,
+    camera: View,
+    material: Material | None = ...,
+    *,
+    channels: Sequence[str],
+    **options: Unpack[Options],
+) -> dict[str, Tensor]: ...
 
 
 def raycast(

@@ -155,7 +155,7 @@ class Surface(ABC):
 
     @abstractmethod
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        """The first hits (R, sheets) in order, or the last ones from the last on."""
+        """The first hits (..., sheets) of rays (..., 3) in order, or the last ones from the last on; or (R, sheets)."""
 
     def hit(self, origins: Array, directions: Array) -> Hits:
         """The first hit of every ray in the domain, t ≥ 0.
@@ -192,8 +192,8 @@ class Surface(ABC):
         """
         check_sheets(sheets)
         origins, directions = check_rays(origins, directions)
-        o, d = (x.detach().reshape(-1, 3) for x in (origins, directions))
-        found = self.detached._sheets(o, d, sheets, farthest).of_rays((*origins.shape[:-1], sheets), origins.dtype)
+        found = self.detached._sheets(origins.detach(), directions.detach(), sheets, farthest)
+        found = found.of_rays((*origins.shape[:-1], sheets), origins.dtype)
         return self._attached(found, origins[..., None, :], directions[..., None, :])
 
     def clearance(self, hit: Hits) -> Tensor:
@@ -234,18 +234,19 @@ class Surface(ABC):
         return SurfacePoints(*spread([row for row in rows if row is not None], index, shape))
 
     def _is_plain(self, origins: Tensor, directions: Tensor, hit: Hits) -> bool:
-        """Whether points are on the rays, gradients those of the jet, and no derivative is asked."""
+        """Whether no derivative is asked."""
         if not origins.numel() or not plain(origins, directions, hit.t):
             return False
-        asked = torch.is_grad_enabled() and self._asked(origins, directions)
-        return not asked and not self._far_from(origins)
+        return not torch.is_grad_enabled() or not self._asked(origins, directions)
 
     def _at_once(self, origins: Tensor, directions: Tensor, hit: Hits, index: Tensor) -> SurfacePoints | None:
         """What is known up to order 1, of rows of hits that are made, and brought to the rays, in one pass each.
 
-        None: some gradient is not known, beside what is missing.
+        None: some ray begins far away, or some gradient is not known, beside what is missing.
         """
-        point = hit_points.points(origins, directions, hit.t, index)
+        point, far = hit_points.points(origins, directions, hit.t, index, self._reach)
+        if far:
+            return None
         piece = None if hit.piece is None else hit.piece.flatten().index_select(0, index)
         found = hit_points.by_rays(index, hit.t.shape, point, self.jet(point, 1, piece)[1])
         return None if found.unknown else SurfacePoints(*found[:3])

@@ -37,7 +37,6 @@ from filterlab.ops.differentiable import heights as jets
 from filterlab.ops.gather import STORAGE
 from filterlab.ops.raycast import Sheets
 from filterlab.ops.reference import heights as reference
-from filterlab.ops.reference.raycast import sheets_by
 from filterlab.surfaces import sight
 from filterlab.surfaces.base import Hits, Surface, check_rays
 from filterlab.surfaces.relief import Relief
@@ -298,9 +297,8 @@ class HeightField(Surface):
         return Hits(ops.first(self.cast, origins.reshape(-1, 3), directions.reshape(-1, 3)))
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        search = lambda o, d: ops.candidates(self.cast, o, d)  # noqa: E731
         asked = Sheets(sheets, farthest, self.domain.diagonal)
-        return Hits(sheets_by(search, origins, directions, asked))
+        return Hits(ops.sheets(self.cast, origins.reshape(-1, 3), directions.reshape(-1, 3), asked))
 
     def met(self, origins: Array, directions: Array) -> Tensor:
         origins, directions = check_rays(origins, directions)

@@ -59,11 +59,12 @@ class InTree(Surface, Generic[Leaves]):
         return self.with_tensors([x.detach() for x in self.tensors])._casting(self.described)
 
     def _first(self, origins: Tensor, directions: Tensor) -> Hits:
-        t, piece = ops.hits(self.described, origins.reshape(-1, 3), directions.reshape(-1, 3), 1)
-        return Hits(t[:, 0], piece[:, 0])
+        found = self._sheets(origins, directions, 1, False)
+        assert found.piece is not None
+        return Hits(found.t[:, 0], found.piece[:, 0])
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        return Hits(*ops.hits(self.described, origins, directions, sheets, farthest))
+        return Hits(*ops.hits(self.described, origins.reshape(-1, 3), directions.reshape(-1, 3), sheets, farthest))
 
 
 def domain_around(boxes: Boxes, radii: Tensor) -> Domain:

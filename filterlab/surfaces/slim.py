@@ -175,13 +175,14 @@ class Slim(Surface):
         return other
 
     def _first(self, origins: Tensor, directions: Tensor) -> Hits:
-        found = self._sheets(origins.reshape(-1, 3), directions.reshape(-1, 3), 1, False)
+        found = self._sheets(origins, directions, 1, False)
         assert found.piece is not None
         assert found.blend is not None
         return Hits(found.t[:, 0], found.piece[:, 0], found.blend[:, 0])
 
     def _sheets(self, origins: Tensor, directions: Tensor, sheets: int, farthest: bool) -> Hits:
-        found = [ops.sheets(side, origins, directions, sheets, farthest) for side in self.described]
+        rays = origins.reshape(-1, 3), directions.reshape(-1, 3)
+        found = [ops.sheets(side, *rays, sheets, farthest) for side in self.described]
         t, *rest, normal, piece = (torch.cat(rows, 1) for rows in zip(*found, strict=True))
         blend = torch.cat((torch.stack((t, *rest), -1), normal), -1)
         if len(found) > 1:

@@ -3,8 +3,10 @@
 import hashlib
 import json
 import math
+import os
 import re
 import struct
+import sys
 from collections.abc import Callable
 from copy import deepcopy
 from functools import cache
@@ -25,6 +27,7 @@ from experiments.headings import known_configs
 from experiments.registry import EXPERIMENTS, load
 from experiments.runs import read_provenance, read_records
 from experiments.views import View
+from filterlab.cli import main as filterlab_main
 from filterlab.io import load_image
 
 VIEW = {
@@ -732,6 +735,26 @@ def test_list_shows_every_config(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(known_configs())
     assert all(len(line.split()) > 3 for line in lines)
+
+
+def test_a_list_that_nobody_reads_on_ends_quietly(capsys, monkeypatch):
+    """`python -m experiments list | head -1`: with the code that `filterlab methods | head -1` ends with."""
+    ended, writing = os.pipe()
+    os.close(ended)
+    for command in (main, filterlab_main):
+        with open(os.dup(writing), "w") as output:
+            monkeypatch.setattr(sys, "stdout", output)
+            assert command(["list" if command is main else "methods"]) == 1
+    monkeypatch.undo()
+    os.close(writing)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_config_that_is_not_known_is_told_the_nearest_name(capsys):
+    assert main(["run", "terain_error"]) == 2
+    told = capsys.readouterr().err
+    assert "did you mean 'terrain_error'? known configs: brick_economy, " in told
+    assert told.count("\n") == 1
 
 
 LISTED = """

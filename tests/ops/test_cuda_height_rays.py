@@ -17,7 +17,7 @@ from filterlab.ops.cuda.height_hulls import HeightHullsVariant
 from filterlab.ops.cuda.height_rays import HeightRaysVariant
 from filterlab.ops.differentiable import height_hits as ops
 from filterlab.ops.height_hits import Cell, HeightHits
-from filterlab.ops.raycast import Candidates
+from filterlab.ops.raycast import Candidates, Sheets
 from filterlab.surfaces.quartic import SPLINES
 from tests import height_rays as classes
 from tests.ops.front_end import intermediate
@@ -66,6 +66,19 @@ def test_bounds_and_hits_are_those_of_plain_torch(case, rays, device):
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
 
 
+def test_sheets_are_those_of_plain_torch(rays, device):
+    """The first ones and the last ones; the first of all is the first hit, bit by bit."""
+    given, (o, d) = cast(("linear", "horizontal", "reflect", "anti"), rays)
+    there, far = on(device, given), (o.to(device), d.to(device))
+    for asked in (Sheets(3, False, 30.0), Sheets(2, True, 30.0)):
+        expected, found = ops.sheets(given, o, d, asked, "reference"), ops.sheets(there, *far, asked, "cuda").cpu()
+        assert torch.equal(found < torch.inf, expected < torch.inf)
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+        assert int((found < torch.inf).all(1).sum()) > rays / 10
+        if not asked.farthest:
+            assert torch.equal(found[:, 0], ops.first(there, *far, "cuda").cpu())
+
+
 @pytest.mark.parametrize("case", CASES[:2])
 def test_pieces_are_those_of_plain_torch(case, rays, device):
     given, (o, d) = cast(case, rays)
@@ -100,7 +113,7 @@ def described(given: HeightHits, values: Tensor, implementation: str) -> HeightH
     return ops.described(replace(given.heights, values=values), implementation)
 
 
-@pytest.mark.parametrize("asked", ["first", "candidates", "bounds"])
+@pytest.mark.parametrize("asked", ["first", "candidates", "sheets", "bounds"])
 def test_the_compiler_takes_the_programs(asked, compiling):
     """Names keep their type in loops and branches, which the interpreter does not ask."""
     from triton.compiler import ASTSource  # pyright: ignore[reportMissingImports]

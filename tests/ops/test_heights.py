@@ -179,7 +179,7 @@ def test_threads_change_nothing_but_the_order_of_sums(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_scattered_points_are_asked_for_and_sorted_without_a_bit_of_difference(monkeypatch, dtype):
+def test_scattered_points_are_sorted_without_a_bit_of_difference(monkeypatch, dtype):
     """Beyond the grid and nowhere too; transposes to rounding, for sums have another order."""
     values = random(2, 40, 50, dtype=dtype)
     points = places(2, 1000, 120.0).to(dtype)
@@ -188,27 +188,38 @@ def test_scattered_points_are_asked_for_and_sorted_without_a_bit_of_difference(m
     monkeypatch.setattr(cpu_heights, "_TILE", (16, 4))
     monkeypatch.setattr(cpu_order, "POINTS_AT_ONCE", 600)
     found = []
-    for asked, sorted_ in ((False, False), (True, False), (True, True)):
-        monkeypatch.setattr(cpu_heights, "_scattered", lambda *_, asked=asked: asked)
+    for sorted_ in (False, True):
         monkeypatch.setattr(cpu_heights, "_sorting_pays", lambda *_, own=sorted_: own)
         found.append((cpu_heights.jet(heights, points, 2), cpu_heights.splat(heights, points, cotangents, 1)))
-    (jet, splat), *others = found
-    for own, spread in others:
-        assert torch.equal(own.nan_to_num(7), jet.nan_to_num(7))
-        close(spread, splat, 1e-4 if dtype is torch.float32 else 1e-12)
+    (jet, splat), (own, spread) = found
+    assert torch.equal(own.nan_to_num(7), jet.nan_to_num(7))
+    close(spread, splat, 1e-4 if dtype is torch.float32 else 1e-12)
     assert int(jet[:, 0].isnan().sum()) == 2
 
 
+@pytest.mark.parametrize("spline", ["linear", "c2"])
+def test_what_lies_near_in_memory_changes_no_bit(spline):
+    """Packs are found some turns before they are summed, and ask memory for data only where these are far apart."""
+    heights, points = given(SPLINES[spline], random(1, 60, 200).float()), places(1, 3003, 190.0).float()
+    order = points[0, :, 0].argsort()
+    jet = cpu_heights.jet(heights, points, 1)
+    for count in (1, 8, 65, 3003):
+        assert torch.equal(cpu_heights.jet(heights, points[:, order[:count]], 1), jet[..., order[:count]])
+        assert torch.equal(cpu_heights.jet(heights, points[:, :count], 1), jet[..., :count])
+
+
 def test_which_points_are_sorted():
-    """Many of a large grid, where patches are no planes; whether they lie all over it is asked before."""
-    values, many = torch.zeros(1, 800, 800), 1 << 16
-    points, heights = places(1, many, 800.0).float(), given(SPLINES["c1"], values)
+    """Many that lie all over more data than caches hold, where patches are no planes."""
+    values, many = torch.zeros(1, 950, 950), 1 << 16
+    points, heights = places(1, many, 950.0).float(), given(SPLINES["c1"], values)
     assert cpu_heights._sorting_pays(heights, values, points)
-    assert not cpu_heights._sorting_pays(given(SPLINES["linear"], values), values, points)
+    assert not cpu_heights._sorting_pays(given(SPLINES["c2"], values), values, points)
     assert not cpu_heights._sorting_pays(heights, values[:, :600], points)
     assert not cpu_heights._sorting_pays(heights, values, points[:, 1:])
-    assert cpu_heights._scattered(heights, values, points)
-    assert not cpu_heights._scattered(heights, values, points.sort(1).values)
+    assert not cpu_heights._sorting_pays(heights, values, points.sort(1).values)
+    wide = torch.zeros(1, 1, 1).expand(1, 2048, 4096)
+    assert cpu_heights._sorting_pays(given(SPLINES["c2"], wide), wide, points)
+    assert not cpu_heights._sorting_pays(given(SPLINES["linear"], wide), wide, points)
 
 
 @pytest.mark.parametrize("boundary", list(Boundary))

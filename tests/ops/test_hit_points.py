@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -33,8 +35,9 @@ def test_points_are_on_the_rays_that_hit(room, dtype, shape):
     o, d, t, index = rays(shape, dtype)
     flat_o, flat_d, flat_t = (x.reshape(-1, n).numpy() for x, n in ((o, 3), (d, 3), (t, 1)))
     expected = [flat_o[i] + flat_t[i] * flat_d[i] for i in range(len(flat_t)) if np.isfinite(flat_t[i])]
-    found = room.points(o, d, t, index)
+    found, far = room.points(o, d, t, index, math.inf)
     assert found.dtype == dtype
+    assert not far
     assert np.array_equal(found, np.reshape(expected, (-1, 3)))
 
 
@@ -67,17 +70,29 @@ def test_it_is_told_that_a_gradient_is_not_known(room, axis):
     assert room.by_rays(torch.arange(5000), torch.Size([5001]), gradient, gradient).unknown
 
 
+@ROOMS
+@DTYPES
+@pytest.mark.parametrize("axis", range(3))
+def test_it_is_told_that_a_ray_that_hits_begins_far_away(room, dtype, axis):
+    origins, directions = torch.full((5000, 3), -2.0, dtype=dtype), torch.ones(5000, 3, dtype=dtype)
+    t, index = torch.ones(5000, dtype=dtype), torch.arange(0, 5000, 2)
+    for ray, component, far in ((4998, -3.5, True), (4998, 3.5, True), (4998, -3.0, False), (4999, -3.5, False)):
+        o = origins.clone()
+        o[ray, axis] = component
+        assert room.points(o, directions, t, index, 3.0).far == far
+
+
 def test_rays_in_steps_are_read_as_they_are():
     o, d, t, _ = rays((40, 50), torch.float32)
     o, d, t = o[:1, :1], d[:, ::2], t[:, ::2]
     index = (t.flatten() < torch.inf).nonzero()[:, 0]
-    assert torch.equal(cpu.points(o, d, t, index), reference.points(o, d, t, index))
+    assert torch.equal(*(room.points(o, d, t, index, math.inf).point for room in (cpu, reference)))
 
 
 def test_what_is_recorded_or_of_two_types_is_left_to_plain_torch():
     o, d, t, index = rays((20,), torch.float64)
-    assert hit_points.points(o, d.clone().requires_grad_(), t, index).requires_grad
-    assert hit_points.points(o, d, t.float(), index).dtype == torch.float64
+    assert hit_points.points(o, d.clone().requires_grad_(), t, index, 1.0).point.requires_grad
+    assert hit_points.points(o, d, t.float(), index, 1.0).point.dtype == torch.float64
 
 
 def test_what_is_known_at_hits_is_the_same_with_and_without_derivatives():

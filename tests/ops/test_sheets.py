@@ -13,8 +13,10 @@ from filterlab.fields.grid import GridField
 from filterlab.kernels import KERNELS
 from filterlab.methods import from_kernel
 from filterlab.ops import cpu
+from filterlab.ops.cpu import raycast as cpu_raycast
 from filterlab.ops.differentiable import raycast
 from filterlab.ops.raycast import Raycast, Sheets
+from filterlab.surfaces import LevelSet
 from tests.ops.test_raycast import AFFINE, LEVEL, described, rays, rays_through_a_level_between_cells, samples
 
 EXTENT = 20.0
@@ -178,6 +180,21 @@ def test_rays_of_an_image_are_hit_as_each_alone(shape, farthest, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     each = [raycast.sheets(described(field), *x, asked(3, farthest), "cpu") for x in rays_one_by_one(o, d)]
     assert torch.equal(found.reshape(-1, 3), torch.stack(each) if each else found.reshape(-1, 3))
+
+
+def test_sheets_of_an_image_go_in_packs_of_two_rows_as_first_hits_do(monkeypatch):
+    shapes = []
+    packed = cpu_raycast._in_packs
+    monkeypatch.setattr(cpu_raycast, "_in_packs", lambda shape, dtype: shapes.append(shape) or packed(shape, dtype))
+    field = fl.reconstruct(samples(), "triquadratic")
+    o, d = (x.reshape(16, 24, 3) for x in rays(field, 384))
+    surface = LevelSet(field, LEVEL)
+    hits = surface.hits(o, d, 3)
+    assert shapes == [(16, 24)]
+    assert torch.equal(hits.t[..., 0], surface.hit(o, d).t)
+    assert shapes == [(16, 24)] * 2
+    each = surface.hits(o.reshape(-1, 3), d.reshape(-1, 3), 3).t.reshape(16, 24, 3)
+    assert torch.equal(hits.t, each)
 
 
 def rays_one_by_one(o: Tensor, d: Tensor) -> list[tuple[Tensor, Tensor]]:

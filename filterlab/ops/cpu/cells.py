@@ -90,7 +90,7 @@ class Walk:
     def __init__(self, lanes: Lanes, job: SimpleNamespace) -> None:
         self.lanes, self.builder, self.job = lanes, lanes.builder, job
         self.integers = ir.VectorType(I32, lanes.count)
-        nothing, zero, never = lanes.constant(0), ir.Constant(self.integers, [0] * lanes.count), self.mask(False)
+        nothing, zero, never = lanes.constant(0), ir.Constant(self.integers, [0] * lanes.count), lanes.mask(False)
         doubles, cells = (lambda: lanes.variable(nothing)), (lambda: lanes.variable(zero))
         self.entry, self.direction = [doubles() for _ in AXES], [doubles() for _ in AXES]
         self._from, self._inverse = [doubles() for _ in AXES], [doubles() for _ in AXES]
@@ -98,9 +98,6 @@ class Walk:
         self.start, self.scale, self._s, self._end = doubles(), doubles(), doubles(), doubles()
         self._cell = [cells() for _ in AXES]
         self.going = lanes.variable(never)
-
-    def mask(self, value: bool) -> Value:
-        return ir.Constant(ir.VectorType(ir.IntType(1), self.lanes.count), [value] * self.lanes.count)
 
     # --- rays ---
 
@@ -286,7 +283,7 @@ class Walk:
 
     def _outside(self, cell: Sequence[Value]) -> Value:
         """A mask of cells beyond the lattice."""
-        b, out = self.builder, self.mask(False)
+        b, out = self.builder, self.lanes.mask(False)
         for i, own in enumerate(cell):
             out = b.or_(out, b.icmp_unsigned(">", own, self._last(i)))
         return out

@@ -30,6 +30,7 @@ from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.cells import Found, Gathered, Walk
 from filterlab.ops.cpu.job import AXES
 from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, I8, I32, I64, STORAGE, Lanes, Value
+from filterlab.ops.cpu.piece_roots import EveryRoot, Signs, first_root
 from filterlab.ops.cpu.polynomials import FirstRoot, NextRoots, Part, Rows
 from filterlab.ops.cpu.restriction import Restriction, Section
 from filterlab.ops.cpu.taps import Grid
@@ -187,7 +188,7 @@ class _Program:
 
     def waiting(self) -> Value:
         """A mask of rays that need not go on."""
-        return self.walk.mask(False)
+        return self.lanes.mask(False)
 
     def done(self) -> Value:
         """A mask of rays that want no more pieces, not even of the cell that they are in."""
@@ -316,7 +317,7 @@ class _Program:
         """A mask of pieces that begin on the other side of the level than the one before ended on."""
         e, b = self.lanes, self.builder
         if self.variant.continuous:
-            return self.walk.mask(False)
+            return self.lanes.mask(False)
         zero, begin, before = e.constant(0), piece.rows[0], piece.before
         up = b.and_(b.fcmp_ordered("<", before, zero), b.fcmp_ordered(">", begin, zero))
         down = b.and_(b.fcmp_ordered(">", before, zero), b.fcmp_ordered("<", begin, zero))
@@ -332,40 +333,28 @@ class _Program:
         return self.places.multiply(s, self.walk.scale.value)
 
 
-@dataclass(frozen=True)
-class Signs:
-    """Pieces that hold the level, made positive where they begin, and what their signs tell.
+class _Located(_Program):
+    """Rays keep the part of a piece that has their root, and those of a pack are searched together.
 
-    Attributes:
-        rows: coefficients; an end that is 0 is the smallest number, so that the level is met there for no sign.
-        begins, ends: masks: where the level is met where the piece begins, or ends.
-        simple: a mask of those that meet it once, and not at their ends.
-        hard: a mask of all others.
+    While a piece is taken `rays` and `piece` are its own.
     """
 
-    rows: Rows
-    begins: Value
-    ends: Value
-    simple: Value
-    hard: Value
-
-
-class _Located(_Program):
-    """Rays keep the part of a piece that has their root, and those of a pack are searched together."""
+    rays: Sequence[Value]
+    piece: Piece
 
     def prepare(self) -> None:
         e, p = self.lanes, self.places
         self.search = self.search_of(self.variant.degree)
         self.part = Part.of(e, self.variant.degree)
         self._near, self._far = p.variable(p.constant(0)), p.variable(p.constant(0))
-        self.hit, self._at_start, self._at_end = (e.variable(self.walk.mask(False)) for _ in range(3))
+        self.hit, self._at_start, self._at_end = (e.variable(self.lanes.mask(False)) for _ in range(3))
 
     def search_of(self, degree: int) -> FirstRoot:
         """Of roots in a piece."""
         return FirstRoot(self.lanes, degree)
 
     def begin(self) -> None:
-        self.hit.value = self._at_start.value = self._at_end.value = self.walk.mask(False)
+        self.hit.value = self._at_start.value = self._at_end.value = self.lanes.mask(False)
 
     def waiting(self) -> Value:
         return self.hit.value
@@ -375,35 +364,24 @@ class _Located(_Program):
         jump = self.jumps(piece)
         holds = b.and_(self.holds(piece, jump), b.not_(self.done()))
         with b.if_then(e.any(holds)):
-            self.roots(rays, piece, self._signs(piece, holds, jump))
+            self.rays, self.piece = rays, piece
+            self.roots(Signs.of(self.search, piece.rows, holds, jump))
 
-    def roots(self, rays: Sequence[Value], piece: Piece, signs: Signs) -> None:
-        """Note parts of pieces that have a root."""
+    def roots(self, signs: Signs) -> None:
+        """Keep parts of `piece` that have a root."""
         raise NotImplementedError
 
-    def _signs(self, piece: Piece, holds: Value, jump: Value) -> Signs:
-        e, b = self.lanes, self.builder
-        zero, begin = e.constant(0), piece.rows[0]
-        turn = e.where(b.fcmp_ordered("<", begin, zero), e.constant(-1), e.constant(1))
-        *rows, end = (e.multiply(turn, r) for r in piece.rows)
-        on_end = b.fcmp_ordered("==", end, zero)  # a root for the case that there is no earlier one
-        rows.append(e.where(on_end, e.constant(2.0**-126 if e.bits == 32 else 2.0**-1022), end))
-        begins = b.and_(holds, b.or_(jump, b.fcmp_ordered("==", begin, zero)))
-        inner = b.and_(holds, b.not_(begins))
-        simple = b.and_(inner, b.and_(self._changes_once(rows), b.fcmp_ordered("<", rows[-1], zero)))
-        return Signs(rows, begins, on_end, simple, b.and_(holds, b.not_(simple)))
+    def keep(self, mask: Value, rows: Rows, a: Value, h: Value) -> None:
+        """Parts that have a root."""
+        self.part.assign(self.lanes, mask, rows, a, h)
 
-    def _changes_once(self, rows: Rows) -> Value:
-        changes = self.search.changes(self.search.negative(self.search.lowered(rows)))
-        return self.builder.icmp_unsigned("==", changes, ir.Constant(changes.type, [1] * self.lanes.count))
-
-    def note(self, piece: Piece, hit: Value, at_start: Value, at_end: Value) -> None:
+    def note(self, hit: Value, at_start: Value, at_end: Value) -> None:
         """That rays have hit, and where their pieces are."""
-        b, p = self.builder, self.places
+        b, p, found = self.builder, self.places, self.piece.found
         for kept, mask in ((self.hit, hit), (self._at_start, at_start), (self._at_end, at_end)):
             kept.value = b.or_(kept.value, mask)
-        self._near.value = p.where(hit, piece.found.near, self._near.value)
-        self._far.value = p.where(hit, piece.found.far, self._far.value)
+        self._near.value = p.where(hit, found.near, self._near.value)
+        self._far.value = p.where(hit, found.far, self._far.value)
 
     def located(self) -> Value:
         """t of the hits that were noted, doubles."""
@@ -424,19 +402,8 @@ class _Located(_Program):
 class _First(_Located):
     """Every ray waits at its first hit."""
 
-    def roots(self, rays: Sequence[Value], piece: Piece, signs: Signs) -> None:
-        e, b = self.lanes, self.builder
-        self.part.assign(e, signs.simple, signs.rows, e.constant(0), e.constant(1))
-        found, hard = e.variable(b.or_(signs.begins, signs.simple)), b.and_(signs.hard, b.not_(signs.begins))
-
-        def keep(mask: Value, rows: Rows, a: Value, h: Value) -> None:
-            self.part.assign(e, mask, rows, a, h)
-            found.value = b.or_(found.value, mask)
-
-        with b.if_then(e.any(hard), likely=False):
-            self.search.first_part(hard, signs.rows, keep)
-        at_end = b.and_(b.and_(hard, signs.ends), b.not_(found.value))
-        self.note(piece, b.or_(found.value, at_end), signs.begins, at_end)
+    def roots(self, signs: Signs) -> None:
+        first_root(self.search, signs, self.keep, self.note)
 
     def finish(self, rays: Sequence[Value]) -> None:
         p = self.places
@@ -454,9 +421,9 @@ class _Sheets(_Located):
         e, p = self.lanes, self.places
         self._none = ir.Constant(ir.VectorType(I64, e.count), [0] * e.count)
         self._one = ir.Constant(self._none.type, [1] * e.count)
-        self._count, self._left = e.variable(self._none), e.variable(self.walk.mask(False))
+        self._count = e.variable(self._none)
         self._last, self._extent = p.variable(p.constant(0)), p.variable(p.constant(0))
-        self._simple, self._begins = (e.variable(self.walk.mask(False)) for _ in range(2))
+        self._every = EveryRoot(self.search, self._room, self.keep, self.note)
 
     def search_of(self, degree: int) -> NextRoots:
         return NextRoots(self.lanes, degree)
@@ -484,38 +451,18 @@ class _Sheets(_Located):
             super().along(rays, directions)
             self._write(rays)
 
-    def roots(self, rays: Sequence[Value], piece: Piece, signs: Signs) -> None:
-        e, b, zero, none = self.lanes, self.builder, self.lanes.constant(0), self.walk.mask(False)
-        at_zero = b.fcmp_ordered("==", piece.rows[0], zero)
-        again = b.and_(b.and_(piece.joined, at_zero), b.fcmp_ordered("==", piece.before, zero))
-        ends = b.and_(signs.ends, self._some(piece.rows))  # else it is met where the piece begins, and stays there
-        self._simple.value, self._begins.value = signs.simple, b.and_(signs.begins, b.not_(again))
-        self._left.value = b.or_(signs.simple, signs.hard)
-        with b.if_then(e.any(signs.hard), likely=False):
-            self.search.begin(signs.hard, signs.rows, e.where(at_zero, zero, e.constant(1)))
-        with e.repeat_while(lambda: e.any(self._left.value)):
-            with b.if_then(e.any(b.and_(self.hit.value, self._left.value))):
-                self._write(rays)
-                self._left.value = b.and_(self._left.value, b.not_(self.done()))
-            left = self._left.value
-            simple, begins = b.and_(left, self._simple.value), b.and_(left, self._begins.value)
-            self.part.assign(e, simple, signs.rows, zero, e.constant(1))
-            self.note(piece, b.or_(simple, begins), begins, none)
-            self._simple.value = self._begins.value = none
-            self._left.value = b.and_(left, b.not_(simple))
-            search = b.and_(self._left.value, b.not_(begins))
-            with b.if_then(e.any(search), likely=False):
-                found, over = self.search.next_part(search, lambda *part: self.part.assign(e, *part))
-                at_end = b.and_(b.and_(over, self.search.above()), b.and_(ends, b.not_(found)))
-                self.note(piece, b.or_(found, at_end), none, at_end)
-                self._left.value = b.and_(self._left.value, b.not_(over))
+    def roots(self, signs: Signs) -> None:
+        piece, b = self.piece, self.builder
+        on_level = b.fcmp_ordered("==", piece.before, self.lanes.constant(0))
+        self._every.write(piece.rows, signs, b.and_(piece.joined, on_level))
 
-    def _some(self, rows: Rows) -> Value:
-        """A mask of those that are not all 0."""
-        size = self.lanes.absolute(rows[0])
-        for row in rows[1:]:
-            size = self.lanes.maximum(size, self.lanes.absolute(row))
-        return self.builder.fcmp_ordered(">", size, self.lanes.constant(0))
+    def _room(self, left: Value) -> Value:
+        """Rays keep one root; those under the mask that have all sheets want no more."""
+        e, b, wanting = self.lanes, self.builder, self.lanes.variable(left)
+        with b.if_then(e.any(b.and_(self.hit.value, left))):
+            self._write(self.rays)
+            wanting.value = b.and_(left, b.not_(self.done()))
+        return wanting.value
 
     def _write(self, rays: Sequence[Value]) -> None:
         """Search the roots that are kept, and write them over those that are k before."""
@@ -529,7 +476,7 @@ class _Sheets(_Located):
                 b.store(e.lane(t, lane), e.advance(j.t, place, DOUBLE))
         self._count.value = b.add(count, b.zext(new, count.type))
         self._last.value = p.where(hit, t, last)
-        self.hit.value = self._at_start.value = self._at_end.value = self.walk.mask(False)
+        self.hit.value = self._at_start.value = self._at_end.value = self.lanes.mask(False)
 
     def finish(self, rays: Sequence[Value]) -> None:
         self.store(self._count.value, self.job.count, I64, rays)

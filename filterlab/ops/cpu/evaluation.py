@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -11,7 +13,7 @@ from filterlab.ops.cpu.gather import Gathering, sorting_may_pay
 from filterlab.ops.cpu.memory import fresh
 from filterlab.ops.cpu.place import Placing
 from filterlab.ops.gather import readable
-from filterlab.ops.place import Placed, Placement
+from filterlab.ops.place import InWorld, Placed, Placement
 from filterlab.ops.tetrahedra import AnyStencil
 
 
@@ -44,8 +46,21 @@ class Evaluator:
             return self._in_steps(points)
         if met & TURNED:
             located, sign = (fresh(points.shape, points.dtype) for _ in range(2))
-            pool.run(self.place.turning, self.place.shared(points, located=located, signs=sign))
+            pool.run(self.place.run, self.place.shared(points, located=located, signs=sign))
         return out, sign
+
+    def in_world(self, points: Tensor, shape: Sequence[int], turned: bool) -> InWorld | None:
+        """(N, M, 3) -> value and gradient in the world, of N C M numbers in the shape asked for; see `Evaluation`."""
+        gather, (entries, count, _) = self.gather, points.shape
+        if sorting_may_pay(count, gather.bytes_of_channel):
+            return None
+        value, gradient = fresh(shape, gather.dtype), fresh((*shape, 3), gather.dtype)
+        if entries and count and gather.channels:
+            jobs = self.program.shared(gather.coefficients, readable(points, 1), value, gradient=gradient)
+            pool.run(self.program.run, jobs)
+            if jobs[0].met & (LOST if turned else LOST | TURNED):
+                return None
+        return value, gradient
 
     def _in_steps(self, points: Tensor) -> Placed:
         located, sign = self.place(points)

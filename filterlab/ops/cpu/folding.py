@@ -31,7 +31,7 @@ FIELDS: dict[str, type] = {
     "next": ctypes.c_int64,  # the chunk to be taken next
     "points": ctypes.c_void_p,  # (M, 3)
     "located": ctypes.c_void_p,  # (M, 3)
-    "signs": ctypes.c_void_p,  # (M, 3); written if the variant says so
+    "signs": ctypes.c_void_p,  # (M, 3); null: they are not written
     "met": ctypes.c_int64,  # TURNED, LOST or both; threads add to it atomically
     "count": ctypes.c_int64,  # M
     "chunk": ctypes.c_int64,  # packs of a chunk
@@ -55,14 +55,12 @@ class FoldingVariant:
     Attributes:
         axes: how x, y and z fold: "reflect", "wrap", "clamp" or "flat".
         affine: "identity", "diagonal" or "full".
-        signs: whether d folded / d voxel is written.
         arithmetic: "float32" or "float64".
         lanes: P.
     """
 
     axes: tuple[str, str, str]
     affine: str
-    signs: bool
     arithmetic: str
     lanes: int
 
@@ -106,11 +104,11 @@ class _Program:
         folded = [self._fold(x, axis) for axis, x in enumerate(self._to_voxel(e.load_triples(points)))]
         shifts = [e.everywhere(e.scalar(getattr(j, f"shift_{a}"))) for a in AXES]
         e.store_triples([e.subtract(x, s) for (x, _), s in zip(folded, shifts, strict=True)], located)
-        if self.variant.signs:
-            e.store_triples([sign for _, sign in folded], signs)
         with b.if_then(partial, likely=False):
             e.copy(own[1], self.copied[1], size)
-            if self.variant.signs:
+        with b.if_then(e.given(j.signs), likely=False):
+            e.store_triples([sign for _, sign in folded], signs)
+            with b.if_then(partial, likely=False):
                 e.copy(own[2], self.copied[2], size)
 
     def _to_voxel(self, points: list[Value]) -> list[Value]:

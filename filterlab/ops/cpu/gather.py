@@ -207,8 +207,12 @@ class Program:
 
     def after(self, place: Placing) -> Program:
         """gather at points that this places first."""
-        job = self.job.copy()
+        job, geometry = self.job.copy(), place.placement.geometry
         job.call(place=place.run, placing=place.job)
+        job.oblique = geometry.diagonal is None
+        for row, numbers in zip(AXES, geometry.inverse, strict=True):
+            for column, number in zip(AXES, numbers, strict=True):
+                setattr(job, f"matrix_{row}{column}", number)
         return replace(self, job=job)
 
     def shared(self, coefficients: Tensor, points: Tensor, rows: Tensor, **gradient: Tensor) -> list[PointsJob]:
@@ -217,7 +221,8 @@ class Program:
         Args:
             points: (N, M, 3).
             rows: (N, C, J, M), contiguous; written by gather, read by pull.
-            gradient: (N, M, 3), written by pull.
+            gradient: (N, M, 3), written by pull; (N, C, M, 3), by gather after a place, of a jet of order 1: then rows
+                are (N, C, M), its values.
         """
         threads = _threads(points)
         blocks = self._blocks(points, threads * CHUNKS_PER_THREAD if threads > 1 else 1)

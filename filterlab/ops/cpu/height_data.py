@@ -2,9 +2,9 @@
 
 A half turn maps the triangles of a cell onto one another: datum (a, b) is σ (a, b) from V0, with a sign σ of every
 lane's own for columns and rows. The data of one row are as far from its one end as from the other, so a lane reads all
-of them in the order of memory, and where σ is −1 pairs of them change places. What is kept of a pack is an address for
-every lane and row. Cells whose data are not all in the grid have theirs copied, through tables that say where indices
-are stored under the boundary; sums in them are added to the grid in the end.
+of them in the order of memory, up to four at a time, and where σ is −1 pairs of them change places. What is kept of a
+pack is an address for every lane and row. Cells whose data are not all in the grid have theirs copied, through tables
+that say where indices are stored under the boundary; sums in them are added to the grid in the end.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from types import SimpleNamespace
 from llvmlite import ir
 
 from filterlab.ops.cpu.lanes import I32, I64, POINTER, Lanes, Storage, Value
+from filterlab.ops.cpu.taps import lines_of_packs, packs_of_lines
 from filterlab.ops.heights import Pattern
+
+_PIECES_AT_ONCE = 6  # of a lane, added before those of the next one: all of most splines
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class _Row:
         columns: of every datum, in the order of memory, how far it is from the first one.
         order: of every datum, in the order of the pattern, which of these it is where σ is 1; counted from the end
             where σ is −1.
+        pieces: columns that lie side by side and are read at once, with those between that are not asked for.
     """
 
     step: int
@@ -38,6 +42,7 @@ class _Row:
     last: int
     columns: tuple[int, ...]
     order: tuple[int, ...]
+    pieces: tuple[range, ...]
 
 
 def _rows_of(pattern: Pattern) -> list[_Row]:
@@ -47,8 +52,19 @@ def _rows_of(pattern: Pattern) -> list[_Row]:
         own = sorted(given)
         columns = tuple(a - own[0] for a in own)
         assert columns == tuple(own[-1] - a for a in reversed(own)), (pattern.name, step)
-        found.append(_Row(step, own[0], own[-1], columns, tuple(map(own.index, given))))
+        found.append(_Row(step, own[0], own[-1], columns, tuple(map(own.index, given)), tuple(_pieces(columns))))
     return found
+
+
+def _pieces(columns: Sequence[int]) -> Iterator[range]:
+    """Columns in ranges of up to four: three or four of four with those between, others if they are neighbours."""
+    left = list(columns)
+    while left:
+        start = left[0]
+        near = [n for n in left if n < start + 4]
+        near = near if len(near) > 2 else [n for n in near if n < start + 2]
+        yield range(start, near[-1] + 1)
+        left = left[len(near) :]
 
 
 class Data:
@@ -73,7 +89,7 @@ class Data:
         self.addresses = lanes.reserve(I64, len(self.rows) * count)  # of a pack, row after row
         self.copied = lanes.reserve(I64, packs)  # whether a lane of it is
         self.outside = lanes.reserve(I64, count)
-        self.copies = lanes.reserve(storage.raw, len(self.rows) * self.width * count)
+        self.copies = lanes.reserve(storage.raw, len(self.rows) * self.width * count + 1)  # three are added as four
         self.told = [lanes.reserve(I64, count) for _ in range(4)]  # column and row of V0, σ; of packs with copies
 
     # --- a pack is found ---
@@ -186,52 +202,71 @@ class Data:
 
     # --- a pack is used ---
 
-    def read(self, index: Value, forward: Value) -> Iterator[Value]:
-        """The data of all lanes, datum after datum.
+    def read(self, index: Value, forward: Value) -> tuple[Value, Iterator[Value]]:
+        """Of all lanes the datum that `Triangle.first` names, and the data, one after the other.
 
         Args:
             forward: a mask: where σ is 1 along columns.
         """
-        for number, row in enumerate(self.rows):
-            data = [self._pack(addresses) for addresses in self._places(index, number)]
-            for own in row.order:
-                yield self._chosen(forward, data[own], data[-1 - own])
+        wanted, number = self.pattern.up.first, 0
+        while wanted >= len(self.rows[number].order):
+            wanted, number = wanted - len(self.rows[number].order), number + 1
+        row = self._row(index, number, forward)
+        every = (row if n == number else self._row(index, n, forward) for n in range(len(self.rows)))
+        return row[wanted], itertools.chain.from_iterable(every)
 
-    def first(self, index: Value, forward: Value) -> Value:
-        """Those that `Triangle.first` names."""
-        wanted = self.pattern.up.first
-        for number, row in enumerate(self.rows):
-            if wanted < len(row.order):
-                places, own = self._places(index, number), row.order[wanted]
-                return self._chosen(forward, self._pack(places[own]), self._pack(places[-1 - own]))
-            wanted -= len(row.order)
-        raise AssertionError(wanted)
+    def _row(self, index: Value, number: int, forward: Value) -> list[Value]:
+        """The data of a row, in the order of the pattern."""
+        e, row = self.lanes, self.rows[number]
+        places, found = self._places(index, number), {}
+        for piece in row.pieces:
+            lines = [self._line(e.advance(place, I64(piece.start), self.storage.raw), len(piece)) for place in places]
+            found |= zip(
+                piece, (e.convert(own, self.storage) for own in packs_of_lines(e, lines, len(piece))), strict=True
+            )
+        data = [found[n] for n in row.columns]
+        return [self._chosen(forward, data[own], data[-1 - own]) for own in row.order]
+
+    def _line(self, address: Value, count: int) -> Value:
+        e, storage = self.lanes, self.storage
+        return e.load(address, storage.raw, count) if count <= 2 else e.load_quad(address, storage, count, room=False)
 
     def _chosen(self, forward: Value, pack: Value, other: Value) -> Value:
         return pack if pack is other else self.lanes.where(forward, pack, other)
 
-    def _places(self, index: Value, number: int) -> list[list[Value]]:
-        """Of every datum in the order of memory where it is, lane by lane."""
-        e, b = self.lanes, self.builder
-        lanes = [b.load(self._address(index, number, I64(lane)), typ=POINTER) for lane in range(e.count)]
-        return [[e.advance(own, I64(n), self.storage.raw) for own in lanes] for n in self.rows[number].columns]
-
-    def _pack(self, addresses: Sequence[Value]) -> Value:
-        e, b = self.lanes, self.builder
-        raw = ir.Constant(ir.VectorType(self.storage.raw, e.count), ir.Undefined)
-        for lane, address in enumerate(addresses):
-            one = b.load(address, typ=self.storage.raw, align=self.storage.bytes)
-            raw = b.insert_element(raw, one, I32(lane))
-        return e.convert(raw, self.storage)
+    def _places(self, index: Value, number: int) -> list[Value]:
+        """Where a row begins in memory, lane by lane."""
+        return [
+            self.builder.load(self._address(index, number, I64(lane)), typ=POINTER) for lane in range(self.lanes.count)
+        ]
 
     def add(self, index: Value, forward: Value, packs: Sequence[Value]) -> None:
-        """To every datum, in the order of `read`."""
-        e, b, left = self.lanes, self.builder, list(packs)
+        """To every datum, in the order of `read`, one lane after the other: two may share a datum.
+
+        What a lane adds waits for what the one before has stored, where part of that is the same: several pieces are
+        written in a row, and neighbours among the points, which may well be so, not one after the other.
+        """
+        e, b = self.lanes, self.builder
+        order = [lane for k in range(4) for lane in range(k, e.count, 4)]
+        every = self._given(forward, packs)
+        while pieces := list(itertools.islice(every, _PIECES_AT_ONCE)):
+            for lane in order:
+                for number, start, lines in pieces:
+                    address = b.load(self._address(index, number, I64(lane)), typ=POINTER)
+                    address = e.advance(address, I64(start), self.storage.raw)
+                    e.store(b.fadd(e.load(address, e.number, lines[lane].type.count), lines[lane]), address)
+
+    def _given(self, forward: Value, packs: Sequence[Value]) -> Iterator[tuple[int, int, list[Value]]]:
+        """What lanes add: number of a row, column of a piece, and for every lane a vector."""
+        left = list(packs)
         for number, row in enumerate(self.rows):
             own, left = left[: len(row.columns)], left[len(row.columns) :]
             own = [own[row.order.index(n)] for n in range(len(own))]
-            for pack, other, addresses in zip(own, reversed(own), self._places(index, number), strict=True):
-                pack = self._chosen(forward, pack, other)
-                for lane, address in enumerate(addresses):
-                    before = b.load(address, typ=e.number, align=self.storage.bytes)
-                    b.store(b.fadd(before, b.extract_element(pack, I32(lane))), address, align=self.storage.bytes)
+            chosen = [self._chosen(forward, pack, other) for pack, other in zip(own, reversed(own), strict=True)]
+            given = dict(zip(row.columns, chosen, strict=True))
+            for piece in row.pieces:
+                yield (
+                    number,
+                    piece.start,
+                    lines_of_packs(self.lanes, [given.get(n, self.lanes.constant(0)) for n in piece]),
+                )

@@ -1,12 +1,14 @@
 """Casting rays at splines of heights as vector code: describes grids and rays to `height_hulls` and `height_rays`.
 
-Memory beyond the result: 8 bytes for every row and column of the data; for candidates 25 + 40 bytes for every ray and
+Memory beyond the result: 8 bytes for every row and column of the data; for sheets 8 bytes for every ray, and as much as
+the result once or twice more for the farthest; for candidates 25 + 40 bytes for every ray and
 each of the `capacity` that there is room for.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -20,7 +22,7 @@ from filterlab.ops.cpu.memory import ARITHMETIC, fresh
 from filterlab.ops.gather import STORAGE, in_whole_rows
 from filterlab.ops.height_hits import DEGREE, Cell, HeightHits, Pyramid, data_of_windows, slack_of
 from filterlab.ops.heights import Heights
-from filterlab.ops.raycast import Candidates, Written, written_in_parts
+from filterlab.ops.raycast import Candidates, Sheets, Written, written_in_parts
 
 
 def pyramid(heights: Heights, cell: Cell) -> Pyramid:
@@ -49,8 +51,16 @@ def met(given: HeightHits, origins: Tensor, directions: Tensor) -> Tensor:
 def _first(given: HeightHits, asked: str, origins: Tensor, directions: Tensor) -> Tensor:
     """t (R,) float64 of first hits; of "met" any where there is one."""
     t = torch.empty(-(-len(origins) // LANES) * LANES, dtype=torch.float64)
-    _cast(given, asked, origins, directions, t=t)
+    _cast(given, asked, origins, directions, {}, t=t)
     return t[: len(origins)]
+
+
+def sheets(given: HeightHits, origins: Tensor, directions: Tensor, asked: Sheets) -> Tensor:
+    """`ops.reference.height_hits.sheets`, fused."""
+    t, count = asked.room(origins.shape[:-1], origins.device)
+    own = {"sheets": asked.count, "most": asked.most, "extent": asked.extent}
+    _cast(given, "sheets", origins, directions, own, t=t, count=count)
+    return asked.in_order(t, count)
 
 
 def candidates(given: HeightHits, origins: Tensor, directions: Tensor) -> Candidates:
@@ -58,19 +68,25 @@ def candidates(given: HeightHits, origins: Tensor, directions: Tensor) -> Candid
 
     def write(rays: Tensor, capacity: int) -> Written:
         written = Written.room(len(rays), capacity, DEGREE, torch.float64, rays.device)
-        _cast(given, "candidates", origins[rays], directions[rays], capacity, **written._asdict())
+        _cast(given, "candidates", origins[rays], directions[rays], {"capacity": capacity}, **written._asdict())
         return written
 
     return written_in_parts(write, DEGREE, len(origins), origins.device)
 
 
 def _cast(
-    given: HeightHits, asked: str, origins: Tensor, directions: Tensor, capacity: int = 0, **results: Tensor
+    given: HeightHits,
+    asked: str,
+    origins: Tensor,
+    directions: Tensor,
+    own: Mapping[str, float],
+    **results: Tensor,
 ) -> None:
+    """Run a program for all rays; `own` are fields of its job, `results` what it writes."""
     if not len(origins):
         return
     heights, pyramid = given.heights, given.pyramid
-    job = HeightRaysJob(rays=len(origins), capacity=capacity, top=pyramid.top)
+    job = HeightRaysJob(rays=len(origins), top=pyramid.top, **own)
     job.cells_x, job.cells_y = heights.cells
     job.shift_x, job.shift_y = heights.origin
     job.spacing_x, job.spacing_y = (given.cell.steps * d for d in heights.spacing)

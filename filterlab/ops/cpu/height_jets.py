@@ -3,8 +3,10 @@
 P points are a pack. Where they are is found in float64, everything else in the arithmetic of the points; each reads the
 data of its own triangle (`ops.cpu.height_data`). A half turn maps the triangles of a cell onto one another, so in each
 lane the data are V0 + σ (a, b), with signs σ of its own, and all arithmetic is that of one triangle: the sums of
-`ops.reference.heights`, masks without their zeros. Some packs are located before the first of them is summed, so that
-memory can be asked for their data.
+`ops.reference.heights`, masks without their zeros.
+
+Packs are located some turns before they are summed: memory brings the data of points that lie all over while others are
+summed. Meanwhile machines do not notice that points and rows lie one after the other: these are asked for as well.
 """
 
 from __future__ import annotations
@@ -20,8 +22,10 @@ from filterlab.ops.cpu.height_data import Data
 from filterlab.ops.cpu.lanes import DOUBLE, I32, I64, STORAGE, Lanes, Value
 from filterlab.ops.heights import Masks, Pattern, rows
 
-_LINES_ASKED = 512  # of memory, at most, before the first of them is read
-_FEWEST_PACKS = 2  # that are located before the first of them is summed
+_LINE = 64  # bytes
+_LINES_ASKED = 128  # of memory, about, for data that are not read yet
+_POINTS_ASKED = 8  # packs before they are located
+_NEAR = 16  # data: points that are no farther from the one before have theirs in lines that are there
 _BEYOND = 2.0**31 - 256  # columns or rows, of points: further than any grid has
 
 # Strides are in numbers.
@@ -42,7 +46,6 @@ FIELDS: dict[str, type] = {
     **{f"{name}_{axis}": ctypes.c_double for name in ("low", "high") for axis in "xy"},  # of a cell's first datum
     **{f"size_{axis}": ctypes.c_int64 for axis in "xy"},  # W, H
     "row_step": ctypes.c_int64,  # from one row of heights to the next
-    "asked": ctypes.c_int64,  # whether memory is asked for data before they are read
 }
 
 
@@ -97,9 +100,9 @@ class _Located:
 
 
 def _packs_at_once(variant: HeightsVariant) -> int:
-    """How many packs are located before the first of them is summed: many where points are never sorted."""
-    rows_of_data = len({b for _, b in variant.pattern.offsets})
-    return _LINES_ASKED // (rows_of_data * variant.lanes) if variant.pattern.degree == 1 else _FEWEST_PACKS
+    """How many packs are kept, from where they are located to where they are summed: a power of two."""
+    fitting = _LINES_ASKED // (variant.pattern.lines * variant.lanes)
+    return max(2, 1 << fitting.bit_length() >> 1)
 
 
 class _Program:
@@ -127,13 +130,30 @@ class _Program:
             own_rows = e.advance(j.rows, e.product(entry, I64(len(self.rows)), j.count), e.number)
             values = e.advance(j.values, b.mul(entry, j.values_entry), self.storage.raw)
             last = e.smaller(b.add(first, j.chunk), packs)
-            with e.repeat(first, last, self.packs) as block:
-                end = e.smaller(b.add(block, I64(self.packs)), last)
-                with e.repeat(block, end) as pack:
-                    self._find(b.mul(pack, I64(e.count)), b.sub(pack, block), points, values)
-                with e.repeat(block, end) as pack:
-                    self._write_pack(b.mul(pack, I64(e.count)), b.sub(pack, block), own_rows, values)
+            ahead = I64(self.packs - 1)
+            with e.repeat(first, b.add(last, ahead)) as found:
+                with b.if_then(b.icmp_signed("<", found, last), likely=True):
+                    self._ask(b.mul(found, I64(e.count)), points, own_rows)
+                    self._find(b.mul(found, I64(e.count)), self._index(found), points, values)
+                pack = b.sub(found, ahead)
+                with b.if_then(b.icmp_signed(">=", pack, first), likely=True):
+                    self._write_pack(b.mul(pack, I64(e.count)), self._index(pack), own_rows, values)
         b.ret_void()
+
+    def _index(self, pack: Value) -> Value:
+        """Of a pack among those that are kept."""
+        return self.builder.and_(pack, I64(self.packs - 1))
+
+    def _ask(self, first: Value, points: Value, own_rows: Value) -> None:
+        """Have what is read one after the other brought near: later points, and the cotangents of these."""
+        e, b = self.lanes, self.builder
+        later = b.mul(b.add(first, I64(_POINTS_ASKED * e.count)), I64(2))
+        asked = [(points, later, 2 * e.count)]
+        if self.variant.operation == "splat":
+            asked += [(own_rows, b.add(b.mul(self.job.count, I64(n)), first), e.count) for n in range(len(self.rows))]
+        for array, start, count in asked:
+            for n in range(0, count, 8 * _LINE // e.bits):
+                e.ask(e.advance(array, b.add(start, I64(n)), e.number))
 
     def _find(self, first: Value, index: Value, points: Value, values: Value) -> None:
         """Locate a pack of points, and their data."""
@@ -150,8 +170,16 @@ class _Program:
         with b.if_then(b.not_(e.all(within)), likely=False):
             start = self._located(places, list(map(self._folded, cells, "xy"))).start
             self.data.copy(values, index, b.not_(within), [*start, *at.signs], self.variant.operation == "splat")
-        with b.if_then(b.icmp_signed("!=", j.asked, I64(0))):
+        with b.if_then(self._scattered(at.start)):
             self.data.ask(index)
+
+    def _scattered(self, start: Sequence[Value]) -> Value:
+        """Whether data of a pack are far from those of a lane before."""
+        e, b = self.lanes, self.builder
+        before = [n - 1 for n in range(1, e.count)]
+        steps = [b.sub(own, e.shuffle(own, own, [0, *before])) for own in start]
+        near = [b.icmp_unsigned("<=", b.add(step, e.integers_32(_NEAR)), e.integers_32(2 * _NEAR)) for step in steps]
+        return b.not_(e.all(e.both(*near)))
 
     def _kept(self, array: Value, packs: int, index: Value, number: int, kind: ir.Type) -> Value:
         """Where pack `number` of so many is that are kept of a pack of points."""
@@ -166,8 +194,7 @@ class _Program:
         s, t = (e.load(self._kept(self.local, 2, index, n, e.number), e.number, e.count) for n in range(2))
         down = e.load(self._kept(self.down, 1, index, 0, I32), I32, e.count)
         if self.variant.operation == "jet":
-            for row, address in zip(self._jet(index, s, t, down), addresses, strict=True):
-                e.store_masked(row, address, within)
+            self._store(self._jet(index, s, t, down), addresses, within)
         else:
             known = b.fcmp_ordered("ord", s, t)
             s, t = (e.where(known, own, e.constant(0)) for own in (s, t))  # 0 · NaN is NaN
@@ -175,6 +202,17 @@ class _Program:
             cotangents = [e.load_masked(address, e.number, within) for address in addresses]
             self._splat(index, s, t, down, [e.where(mask, own, e.constant(0)) for own in cotangents])
             self.data.give(values, index)
+
+    def _store(self, found: Sequence[Value], addresses: Sequence[Value], within: Value) -> None:
+        """Rows of a pack. No mask where all lanes have points: with one machines take many times as long to store."""
+        e, b = self.lanes, self.builder
+        with b.if_else(e.all(within), likely=True) as (whole, partly):
+            with whole:
+                for row, address in zip(found, addresses, strict=True):
+                    e.store(row, address)
+            with partly:
+                for row, address in zip(found, addresses, strict=True):
+                    e.store_masked(row, address, within)
 
     # --- where points are ---
 
@@ -261,8 +299,8 @@ class _Program:
     def _jet(self, index: Value, s: Value, t: Value, down: Value) -> list[Value]:
         e = self.lanes
         forward = self._forward(down)
-        base = self.data.first(index, forward)
-        coefficients = self.masks.coefficients(e.subtract(datum, base) for datum in self.data.read(index, forward))
+        base, data = self.data.read(index, forward)
+        coefficients = self.masks.coefficients(e.subtract(datum, base) for datum in data)
         found = self.masks.derivatives(coefficients, self._barycentric(s, t), self.variant.order)
         value, *others = (e.multiply(own, factor) for own, factor in zip(found, self._factors(down), strict=True))
         value = e.add(value, base)

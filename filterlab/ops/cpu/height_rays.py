@@ -10,7 +10,8 @@ For P rays in turn, as `ops.height_hits` says:
     signs       no change of sign: on. One: there is the hit, the ray waits for the others
                 several: the part that holds the first root is looked for at once (`ops.cpu.polynomials`)
 
-and then one root search for all.
+and then one root search for all. Where every hit is asked for, rays go on with what they keep, and P roots are searched
+whenever there are so many, of whatever rays they are.
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ from filterlab import bernstein
 from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.height_cells import GRID, LOWER, UPPER, Windows
 from filterlab.ops.cpu.lanes import ARITHMETIC, DOUBLE, FLOAT, I1, I8, I64, STORAGE, Lanes, Value, Variable
-from filterlab.ops.cpu.polynomials import FirstRoot, Rows
+from filterlab.ops.cpu.piece_roots import EveryRoot, Signs, first_root
+from filterlab.ops.cpu.polynomials import FirstRoot, NextRoots, Rows
 from filterlab.ops.height_hits import DEGREE, POINTS, Cell
 from filterlab.ops.pieces import NO_MOTION
-from filterlab.ops.raycast import REPEATED
+from filterlab.ops.raycast import PLACES_APART, REPEATED
 
 LANES = 4
 PACKS_OF_A_CHUNK = 16
@@ -55,9 +57,12 @@ FIELDS: dict[str, type] = {
     "origins": ctypes.c_void_p,  # (R, 3) numbers, in the world
     "directions": ctypes.c_void_p,  # (R, 3) numbers
     "rays": ctypes.c_int64,
-    "t": ctypes.c_void_p,  # (R) d, written, in whole packs: of the first hit
+    "t": ctypes.c_void_p,  # (R) d, written, in whole packs: of the first hit; (R, k) where sheets are
+    "sheets": ctypes.c_int64,  # k, places for sheets of a ray, which are written in a ring
+    "most": ctypes.c_int64,  # sheets behind which no more are looked for
+    "extent": ctypes.c_double,  # the diagonal of the domain, in the world
     "capacity": ctypes.c_int64,  # K, candidates of a ray that there is room for
-    "count": ctypes.c_void_p,  # (R) int64, written: candidates of a ray, also those that there is no room for
+    "count": ctypes.c_void_p,  # (R) int64, written: candidates or sheets of a ray, also those that there is no room for
     "places": ctypes.c_void_p,  # (R, K, 3) d, written: start, near, far
     "pieces": ctypes.c_void_p,  # (R, K, 5) d, written
     "flags": ctypes.c_void_p,  # (R, K) bytes of `REPEATED`, written
@@ -74,7 +79,7 @@ class HeightRaysVariant:
     """Everything the program depends on, apart from the machine.
 
     Attributes:
-        asked: "first", "met" or "candidates".
+        asked: "first", "met", "sheets" or "candidates".
         cell: what the coefficients of a cell are made of.
         storage: dtype of the heights.
         rays: "float32" or "float64".
@@ -88,7 +93,7 @@ class HeightRaysVariant:
     def generate(self) -> str:
         """The program as LLVM IR text."""
         module, function = frame.new_module()
-        (_Candidates if self.asked == "candidates" else _First)(self, function).write()
+        _PROGRAMS[self.asked](self, function).write()
         return str(module)
 
 
@@ -152,6 +157,7 @@ class _Program:
                     with e.repeat(first, e.smaller(b.add(first, I64(LANES)), last)) as number:
                         self._walk(number, b.sub(number, first), b.sub(number, ahead))
                     self.finish(first)
+            self.close()
         b.ret_void()
 
     def prepare(self) -> None:
@@ -166,6 +172,9 @@ class _Program:
 
     def finish(self, first: Value) -> None:
         """A pack of lines from that number on has ended."""
+
+    def close(self) -> None:
+        """A chunk has ended."""
 
     # --- the way ---
 
@@ -274,7 +283,7 @@ class _Program:
             self.relevant.value = self._meets(line, cell, level, s, out)
         with b.if_then(self.relevant.value), b.if_else(b.icmp_signed(">", level, I64(0))) as (down, here):
             with down:
-                self.level.value, self.on.value = b.sub(level, I64(1)), I1(0)
+                self.level.value, self.on.value = self._lower(level), I1(0)
                 self._ask_for_bounds(cell, self._larger(b.sub(level, I64(_LEVELS_AHEAD)), I64(self.cell.finest)))
             with here:
                 in_cell(cell, s, out)
@@ -312,7 +321,7 @@ class _Program:
     def _advance(self, line: _Line, cell: Sequence[Value], level: Value, ways: Sequence[Value], out: Value) -> None:
         """To the beginning of the next block."""
         e, b, j = self.lanes, self.builder, self.job
-        along_y = b.fcmp_ordered("<", ways[1], ways[0])
+        along_y, up = b.fcmp_ordered("<", ways[1], ways[0]), self._higher(level)
         self.s.value = out
         leaves = inside = None
         for axis, count in enumerate((j.cells_x, j.cells_y)):
@@ -326,14 +335,22 @@ class _Program:
             across = b.select(forward, next_, b.sub(low, I64(1)))
             new = b.select(along_y if axis else b.not_(along_y), across, place)
             self.cell_at[axis].value = new
-            up = b.add(level, I64(1))
             left = b.icmp_signed("!=", b.ashr(new, up), b.ashr(own, up))
             fits = b.and_(b.icmp_signed(">=", new, I64(0)), b.icmp_signed("<", new, count))
             leaves = left if leaves is None else b.or_(leaves, left)
             inside = fits if inside is None else b.and_(inside, fits)
-        higher = e.smaller(b.add(level, I64(1)), j.top)
-        self.level.value = b.select(leaves, higher, level)
+        self.level.value = b.select(leaves, e.smaller(up, j.top), level)
         self.going.value = b.and_(inside, b.fcmp_ordered("<", out, line.far))
+
+    def _lower(self, level: Value) -> Value:
+        """See `ops.height_hits`: of the smallest blocks cells."""
+        b, finest = self.builder, I64(self.cell.finest)
+        return b.select(b.icmp_signed(">", level, finest), b.sub(level, I64(1)), I64(0))
+
+    def _higher(self, level: Value) -> Value:
+        """Of cells the smallest blocks."""
+        b, finest = self.builder, I64(self.cell.finest)
+        return b.select(b.icmp_signed(">=", level, finest), b.add(level, I64(1)), finest)
 
     # --- cells ---
 
@@ -461,77 +478,200 @@ class _Program:
             self.take(line, lane, rows, near, far, b.and_(joined, b.fcmp_ordered("==", before, zero)))
 
 
-class _First(_Program):
-    """Every line waits at its first hit, and all of a pack are searched together."""
+class _Located(_Program):
+    """Lines keep parts of pieces that have a root, in places, and those of a pack of places are searched together.
+
+    While a piece is taken `here` is its line, and where the piece begins and ends. A piece is the same in every lane.
+    """
+
+    here: tuple[_Line, Value, Value]
 
     def prepare(self) -> None:
         e = self.lanes
-        self.search = FirstRoot(e, DEGREE)
+        self.search = self.search_of(DEGREE)
         self.rows = e.reserve(DOUBLE, _N * LANES)
         self.a, self.h, self.near, self.far, self.start, self.length = (e.reserve(DOUBLE, LANES) for _ in range(6))
         self.kind = e.reserve(I64, LANES)
 
-    def begin(self) -> None:
+    def search_of(self, degree: int) -> FirstRoot:
+        """Of roots in a piece."""
+        return FirstRoot(self.lanes, degree)
+
+    def place(self) -> Value:
+        """The number of the next free place."""
+        raise NotImplementedError
+
+    def roots(self, rows: Rows, signs: Signs, repeated: Value) -> None:
+        """Keep parts of a piece that have a root; where it begins there is one already if it is `repeated`."""
+        raise NotImplementedError
+
+    def clear(self) -> None:
+        """No place is taken."""
         e, one, zero = self.lanes, self.lanes.constant(1), self.lanes.constant(0)
         for n in range(_N):
             e.store(one, e.advance(self.rows, I64(n * LANES), DOUBLE))
-        for place in (self.a, self.near, self.far, self.start, self.length):
-            e.store(zero, place)
+        for array in (self.a, self.near, self.far, self.start, self.length):
+            e.store(zero, array)
         e.store(one, self.h)
         e.store(e.integers(_NOTHING), self.kind)
 
     def take(self, line: _Line, lane: Value, rows: Rows, near: Value, far: Value, repeated: Value) -> None:
-        e, b, search, zero = self.lanes, self.builder, self.search, DOUBLE(0.0)
-        turn = b.select(b.fcmp_ordered("<", rows[0], zero), DOUBLE(-1.0), DOUBLE(1.0))
-        at_start = b.fcmp_ordered("==", rows[0], zero)
-        *own, end = (e.multiply(turn, row) for row in rows)
-        on_end = b.fcmp_ordered("==", end, zero)  # a root for the case that there is no earlier one
-        own.append(b.select(on_end, DOUBLE(2.0**-1022), end))
-        packs = [e.everywhere(row) for row in own]
-        changes = search.changes(search.negative(search.lowered(packs)))
-        once = b.icmp_unsigned("==", e.lane(changes, 0), I8(1))
-        simple = b.and_(b.and_(b.not_(at_start), once), b.fcmp_ordered("<", own[-1], zero))
-        kind = e.variable(I64(_NOTHING))
-        kind.value = b.select(at_start, I64(_AT_START), b.select(simple, I64(_INNER), I64(_NOTHING)))
-        with b.if_then(simple):
-            self._keep(lane, own, zero, DOUBLE(1.0))
-        with b.if_then(b.icmp_signed("==", kind.value, I64(_NOTHING)), likely=False):
-            kind.value = b.select(on_end, I64(_AT_END), I64(_NOTHING))
+        e, packs = self.lanes, [self.lanes.everywhere(row) for row in rows]
+        self.here = line, near, far
+        signs = Signs.of(self.search, packs, e.mask(True), e.mask(False))
+        self.roots(packs, signs, repeated)
 
-            def keep(mask: Value, part: Rows, a: Value, h: Value) -> None:
-                self._keep(lane, *([e.lane(p, 0) for p in part], e.lane(a, 0), e.lane(h, 0)))
-                kind.value = I64(_INNER)
+    def keep(self, mask: Value, rows: Rows, a: Value, h: Value) -> None:
+        """A part that has a root."""
+        e, b, place = self.lanes, self.builder, self.place()
+        with b.if_then(e.lane(mask, 0)):
+            for n, row in enumerate(rows):
+                b.store(e.lane(row, 0), e.advance(self.rows, b.add(place, I64(n * LANES)), DOUBLE))
+            for array, pack in ((self.a, a), (self.h, h)):
+                b.store(e.lane(pack, 0), e.advance(array, place, DOUBLE))
 
-            search.first_part(ir.Constant(ir.VectorType(I1, LANES), [True] * LANES), packs, keep)
-        with b.if_then(b.icmp_signed("!=", kind.value, I64(_NOTHING))):
-            self.going.value = I1(0)
-            b.store(kind.value, e.advance(self.kind, lane, I64))
-            ends = (self.near, near), (self.far, far), (self.start, line.start), (self.length, line.length)
-            for array, value in ends:
-                b.store(value, e.advance(array, lane, DOUBLE))
+    def note(self, hit: Value, at_start: Value, at_end: Value) -> None:
+        """That there is a root in the next place."""
+        e, b, (line, near, far) = self.lanes, self.builder, self.here
+        begins, ends = (e.lane(mask, 0) for mask in (at_start, at_end))
+        with b.if_then(e.lane(hit, 0)):
+            place = self.place()
+            kind = b.select(begins, I64(_AT_START), b.select(ends, I64(_AT_END), I64(_INNER)))
+            b.store(kind, e.advance(self.kind, place, I64))
+            numbers = (self.near, near), (self.far, far), (self.start, line.start), (self.length, line.length)
+            for array, value in numbers:
+                b.store(value, e.advance(array, place, DOUBLE))
+            self.noted(line)
 
-    def _keep(self, lane: Value, rows: Rows, a: Value, h: Value) -> None:
-        e, b = self.lanes, self.builder
-        for n, row in enumerate(rows):
-            b.store(row, e.advance(self.rows, b.add(lane, I64(n * LANES)), DOUBLE))
-        for array, value in ((self.a, a), (self.h, h)):
-            b.store(value, e.advance(array, lane, DOUBLE))
+    def noted(self, line: _Line) -> None:
+        """A root of a line is in the next place."""
+        raise NotImplementedError
 
-    def finish(self, first: Value) -> None:
+    def located(self, search: bool = True) -> Value:
+        """t of all places, ∞ of those that are not taken; without a search anywhere in the part."""
         e, b = self.lanes, self.builder
         kind = e.load(self.kind, I64, LANES)
         a, h, near, far = (e.load(x, DOUBLE, LANES) for x in (self.a, self.h, self.near, self.far))
         start, length = (e.load(x, DOUBLE, LANES) for x in (self.start, self.length))
         is_ = lambda k: b.icmp_signed("==", kind, e.integers(k))  # noqa: E731
         within = e.variable(e.constant(0))
-        if self.variant.asked == "first":
+        if search:
             with b.if_then(e.any(is_(_INNER))):
                 rows = [e.load(e.advance(self.rows, I64(n * LANES), DOUBLE), DOUBLE, LANES) for n in range(_N)]
                 within.value = e.multiply_add(self.search.root(rows, is_(_INNER)), h, a)
         own = e.where(is_(_AT_START), e.constant(0), e.where(is_(_AT_END), e.constant(1), within.value))
         s = e.minimum(e.maximum(e.multiply_add(e.subtract(far, near), own, near), near), far)
-        found = e.where(is_(_NOTHING), e.constant(math.inf), e.multiply(length, e.add(start, s)))
-        e.store(found, e.advance(self.job.t, first, DOUBLE))
+        return e.where(is_(_NOTHING), e.constant(math.inf), e.multiply(length, e.add(start, s)))
+
+
+class _First(_Located):
+    """Every line waits at its first hit, in the place of its lane."""
+
+    lane: Value
+
+    def begin(self) -> None:
+        self.clear()
+
+    def place(self) -> Value:
+        return self.lane
+
+    def take(self, line: _Line, lane: Value, rows: Rows, near: Value, far: Value, repeated: Value) -> None:
+        self.lane = lane
+        super().take(line, lane, rows, near, far, repeated)
+
+    def roots(self, rows: Rows, signs: Signs, repeated: Value) -> None:
+        first_root(self.search, signs, self.keep, self.note)
+
+    def noted(self, line: _Line) -> None:
+        self.going.value = I1(0)
+
+    def finish(self, first: Value) -> None:
+        found = self.located(self.variant.asked == "first")
+        self.lanes.store(found, self.lanes.advance(self.job.t, first, DOUBLE))
+
+
+class _Sheets(_Located):
+    """Roots are kept line after line, and searched when there is no place left, or a line may have all its sheets.
+
+    Hits that rounding alone has apart are one.
+    """
+
+    search: NextRoots
+
+    def prepare(self) -> None:
+        super().prepare()
+        e = self.lanes
+        self.every = EveryRoot(self.search, self._room, self.keep, self.note)
+        self.number, self.found = e.reserve(I64, LANES), e.reserve(DOUBLE, LANES)
+        self.taken, self.own = (e.variable(I64(0)) for _ in range(2))  # places, and those of the line itself
+        self.last, self.last_number = e.variable(DOUBLE(0.0)), e.variable(I64(-1))
+        self.clear()
+
+    def search_of(self, degree: int) -> NextRoots:
+        return NextRoots(self.lanes, degree)
+
+    def place(self) -> Value:
+        return self.taken.value
+
+    def noted(self, line: _Line) -> None:
+        e, b = self.lanes, self.builder
+        b.store(line.number, e.advance(self.number, self.taken.value, I64))
+        self.taken.value = b.add(self.taken.value, I64(1))
+        self.own.value = b.add(self.own.value, I64(1))
+
+    def _has_all(self, line: _Line) -> Value:
+        """Whether a line has all sheets, if what it keeps is some."""
+        b, j = self.builder, self.job
+        written = b.load(self.lanes.advance(j.count, line.number, I64), typ=I64)
+        return b.icmp_signed(">=", b.add(written, self.own.value), j.most)
+
+    def roots(self, rows: Rows, signs: Signs, repeated: Value) -> None:
+        line, _, _ = self.here
+        self.every.write(rows, signs, self.lanes.everywhere(repeated))
+        with self.builder.if_then(self._has_all(line)):
+            self._write()
+            self.going.value = self.builder.not_(self._has_all(line))
+
+    def _room(self, left: Value) -> Value:
+        e, b, (line, _, _) = self.lanes, self.builder, self.here
+        full, wanting = b.icmp_signed(">=", self.taken.value, I64(LANES)), e.variable(left)
+        with b.if_then(b.or_(full, self._has_all(line))):
+            self._write()
+            wanting.value = b.select(e.everywhere(self._has_all(line)), e.mask(False), left)
+        return wanting.value
+
+    def _walk(self, number: Value, lane: Value, place: Value) -> None:
+        self.own.value = I64(0)
+        super()._walk(number, lane, place)
+
+    def close(self) -> None:
+        self._write()
+
+    def _write(self) -> None:
+        """Search the roots that are kept, and write them over those that are k before."""
+        e = self.lanes
+        e.store(self.located(), self.found)
+        with e.repeat(I64(0), self.taken.value) as place:
+            self._write_one(place)
+        e.store(e.integers(_NOTHING), self.kind)
+        self.taken.value = self.own.value = I64(0)
+
+    def _write_one(self, place: Value) -> None:
+        e, b, j = self.lanes, self.builder, self.job
+        t = self._number(self.found, place)
+        number = b.load(e.advance(self.number, place, I64), typ=I64)
+        x, y, z = (self._size(d) for d in self._world(j.directions, number))
+        extent = e.divide(j.extent, e.maximum(e.maximum(x, y), z))
+        apart = e.multiply(e.add(t, extent), DOUBLE(PLACES_APART * 2.0**-52))
+        same = b.icmp_signed("==", number, self.last_number.value)
+        last = b.select(same, self.last.value, DOUBLE(-math.inf))
+        self.last.value, self.last_number.value = t, number
+        with b.if_then(b.fcmp_ordered(">", e.subtract(t, last), apart)):
+            written = e.advance(j.count, number, I64)
+            count = b.load(written, typ=I64)
+            slot = b.add(b.mul(number, j.sheets), b.urem(count, j.sheets))
+            b.store(t, e.advance(j.t, slot, DOUBLE))
+            b.store(b.add(count, I64(1)), written)
 
 
 class _Candidates(_Program):
@@ -557,3 +697,11 @@ class _Candidates(_Program):
                 for n, number in enumerate(numbers):
                     b.store(number, e.advance(array, b.add(b.mul(index, I64(len(numbers))), I64(n)), kind))
         self.count.value = b.add(count, I64(1))
+
+
+_PROGRAMS: dict[str, type[_Program]] = {
+    "first": _First,
+    "met": _First,
+    "candidates": _Candidates,
+    "sheets": _Sheets,
+}

@@ -4,7 +4,7 @@ Same meaning as `ops.reference.heights`. Heights are read as they are stored, su
 of jet does not depend on the number of threads, bit by bit; that of splat only on their number. Memory beyond the
 results: 8 bytes for every row and column of the heights; of splat a copy of the result for every further thread.
 
-Points that lie all over a large grid wait for memory. Their data are asked for ahead; where a patch has more than 3,
+Points that lie all over a large grid wait for memory. Their data are asked for ahead; where caches hold no part of it,
 many points are sorted by tiles first (`ops.cpu.order`), in copies of a part of them.
 """
 
@@ -28,10 +28,8 @@ from filterlab.volume import Boundary
 
 _POINTS_PER_THREAD = 2048  # fewer are not worth waking a thread for
 _TILE = (256, 4)  # columns, rows by which points are sorted: rows of a grid may be apart by what caches keep together
-_SMALLEST_SORTED_IN = 2 << 20  # bytes of a grid
+_SMALLEST_SORTED_IN = 32 << 20  # bytes of a grid, times the rows in which a patch has its data
 _NEAR = 16  # data: points that are farther from the one before are scattered
-_FEWEST_SCATTERED = 4096  # points of a grid
-_SMALLEST_SCATTERED_IN = 512 << 10  # bytes of a grid
 
 
 def jet(heights: Heights, points: Tensor, order: int) -> Tensor:
@@ -41,20 +39,19 @@ def jet(heights: Heights, points: Tensor, order: int) -> Tensor:
     if not out.numel():
         return out
     values, points = _in_lines(heights.values), readable(points, 1)
-    asked = _scattered(heights, values, points)
-    if not (asked and _sorting_pays(heights, values, points)):
-        _jet(heights, values, points, out, order, asked)
+    if not _sorting_pays(heights, values, points):
+        _jet(heights, values, points, out, order)
         return out
     for entry, part, ordered in in_order(points, _tiles(heights)):
         own = fresh((1, out.shape[1], ordered.count), points.dtype)
-        _jet(heights, values[entry : entry + 1], ordered.points[None], own, order, False)
+        _jet(heights, values[entry : entry + 1], ordered.points[None], own, order)
         ordered.restore(own[0], out[entry, :, part])
     return out
 
 
-def _jet(heights: Heights, values: Tensor, points: Tensor, out: Tensor, order: int, asked: bool) -> None:
+def _jet(heights: Heights, values: Tensor, points: Tensor, out: Tensor, order: int) -> None:
     threads = threads_for(points.shape[0] * points.shape[1], _POINTS_PER_THREAD)
-    job, run = _described("jet", heights, values, points, out, order, asked, threads * CHUNKS_PER_THREAD)
+    job, run = _described("jet", heights, values, points, out, order, threads * CHUNKS_PER_THREAD)
     pool.run(run, [job] * threads)
 
 
@@ -73,24 +70,21 @@ def splat(heights: Heights, points: Tensor, cotangents: Tensor, order: int) -> T
     parts = max(1, min(parts, 8 * n * m // size))
     every = [out, *(zeros(shape, out.dtype) for _ in range(parts - 1))]
     points, cotangents = readable(points, 1), readable(cotangents.to(points.dtype), 0)
-    asked = _scattered(heights, out, points)
-    if not (asked and _sorting_pays(heights, out, points)):
-        _splat(heights, every, points, cotangents, order, asked)
+    if not _sorting_pays(heights, out, points):
+        _splat(heights, every, points, cotangents, order)
     else:
         for entry, part, ordered in in_order(points, _tiles(heights)):
             own = fresh((1, cotangents.shape[1], ordered.count), points.dtype)
             ordered.arrange(cotangents[entry, :, part], own[0])
-            _splat(heights, [grid[entry : entry + 1] for grid in every], ordered.points[None], own, order, False)
+            _splat(heights, [grid[entry : entry + 1] for grid in every], ordered.points[None], own, order)
     for other in every[1:]:
         out += other
     return out.contiguous()
 
 
-def _splat(
-    heights: Heights, grids: Sequence[Tensor], points: Tensor, cotangents: Tensor, order: int, asked: bool
-) -> None:
+def _splat(heights: Heights, grids: Sequence[Tensor], points: Tensor, cotangents: Tensor, order: int) -> None:
     """An equal share of the points to every grid."""
-    job, run = _described("splat", heights, grids[0], points, cotangents, order, asked, len(grids))
+    job, run = _described("splat", heights, grids[0], points, cotangents, order, len(grids))
     pool.run(run, [_share(job, own, part, len(grids)) for part, own in enumerate(grids)])
 
 
@@ -114,10 +108,9 @@ def _described(
     points: Tensor,
     rows_: Tensor,
     order: int,
-    asked: bool,
     parts: int,
 ):
-    """The job of all points, in at least so many chunks, and its program; asked: whether memory is, for data ahead."""
+    """The job of all points, in at least so many chunks, and its program."""
     entries, count = points.shape[:2]
     pattern, boundary = heights.pattern, heights.boundary
     lanes = lanes_of(points.dtype)
@@ -125,7 +118,6 @@ def _described(
     chunk = max(1, min(-(-packs // max(1, parts // entries)), MOST_POINTS // lanes))
     job = HeightsJob(next=0, count=count, entries=entries, chunk=chunk, chunks=entries * -(-packs // chunk))
     job.values_entry, job.points_entry, job.row_step = values.stride(0), points.stride(0), values.stride(-2)
-    job.asked = asked
     job.point(values=values, points=points, rows=rows_)
     for axis, name in enumerate(("column", "line")):
         n, letter = values.shape[-1 - axis], "xy"[axis]
@@ -140,21 +132,15 @@ def _described(
     return job, compiler.compiled(variant)
 
 
-def _scattered(heights: Heights, values: Tensor, points: Tensor) -> bool:
-    """Whether points (N, M, 2) wait for memory: they lie all over a grid that a core's own cache does not hold."""
-    if points.shape[1] < _FEWEST_SCATTERED or _bytes_of(values) < _SMALLEST_SCATTERED_IN:
+def _sorting_pays(heights: Heights, values: Tensor, points: Tensor) -> bool:
+    """Whether sorting points (N, M, 2) costs less than it saves: many of them lie all over what no cache holds.
+
+    Not for planes, whose data are asked for in time.
+    """
+    read = values[0].numel() * values.element_size() * heights.pattern.lines
+    if points.shape[1] < FEWEST_SORTED or read < _SMALLEST_SORTED_IN or heights.pattern.degree == 1:
         return False
     return scattered(points, _NEAR * points.new_tensor(heights.spacing).abs())
-
-
-def _sorting_pays(heights: Heights, values: Tensor, points: Tensor) -> bool:
-    """Whether sorting scattered points costs less than it saves: not for planes, whose data are asked for in time."""
-    enough = points.shape[1] >= FEWEST_SORTED and _bytes_of(values) >= _SMALLEST_SORTED_IN
-    return enough and heights.pattern.degree > 1
-
-
-def _bytes_of(values: Tensor) -> int:
-    return values[0].numel() * values.element_size()
 
 
 def _tiles(heights: Heights) -> Bricks:

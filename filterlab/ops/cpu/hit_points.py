@@ -11,16 +11,16 @@ from torch import Tensor
 
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
-from filterlab.ops.cpu.hit_rows import UNKNOWN, HitRowsJob, HitRowsVariant
+from filterlab.ops.cpu.hit_rows import FAR, UNKNOWN, HitRowsJob, HitRowsVariant
 from filterlab.ops.cpu.machine import threads_for
 from filterlab.ops.cpu.memory import ARITHMETIC, fresh
-from filterlab.ops.hit_points import ByRays
+from filterlab.ops.hit_points import ByRays, OnRays
 
 _CHUNK = 4096  # rays: what is written of them stays in the cache between its two passes
 _RAYS_PER_THREAD = 16384  # fewer are not worth waking a thread for
 
 
-def points(origins: Tensor, directions: Tensor, t: Tensor, index: Tensor) -> Tensor:
+def points(origins: Tensor, directions: Tensor, t: Tensor, index: Tensor, reach: float) -> OnRays:
     """`ops.reference.hit_points.points`, fused; of rays and t of one type, without derivatives."""
     out = fresh((len(index), 3), t.dtype)
     job = _job(index, t.numel())
@@ -29,8 +29,9 @@ def points(origins: Tensor, directions: Tensor, t: Tensor, index: Tensor) -> Ten
         job.point(**{name: rows})
         setattr(job, f"{name}_step", step)
     job.point(t=t.contiguous(), points=out)
+    job.reach = reach
     _run("points", job, t.dtype)
-    return out
+    return OnRays(out, bool(job.met & FAR))
 
 
 def by_rays(index: Tensor, shape: torch.Size, point: Tensor, gradient: Tensor) -> ByRays:

@@ -11,14 +11,15 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 from llvmlite import ir
 
 from filterlab.ops.cpu import frame, job
 from filterlab.ops.cpu.lanes import ARITHMETIC, I64, Lanes, Value
 
-UNKNOWN = 1
-"""A job may have met it: a gradient that is NaN."""
+UNKNOWN, FAR = 1, 2
+"""What a job may have met: a gradient that is NaN; the origin of a hit beyond the reach."""
 
 # Arrays are contiguous but for steps, in numbers; "number" is the type of the arithmetic.
 FIELDS: dict[str, type] = {
@@ -40,7 +41,8 @@ FIELDS: dict[str, type] = {
     "rays": ctypes.c_int64,  # R
     "chunk": ctypes.c_int64,  # rays of a chunk
     "chunks": ctypes.c_int64,
-    "met": ctypes.c_int64,  # `UNKNOWN` or 0; threads add to it atomically
+    "met": ctypes.c_int64,  # `UNKNOWN` and `FAR`; threads add to it atomically
+    "reach": ctypes.c_double,  # of |o_k|; read by points
 }
 
 
@@ -101,6 +103,9 @@ class _Program:
         direction = self._load(j.directions, b.mul(ray, j.directions_step), I64(1))
         (t,) = self._load(j.t, ray, I64(1), 1)
         found = [b.fadd(o, b.fmul(t, d)) for o, d in zip(origin, direction, strict=True)]
+        reach = self.lanes.scalar(j.reach)
+        beyond = [b.fcmp_ordered(">", x, reach) for o in origin for x in (o, b.fneg(o))]
+        self.met.value = b.or_(self.met.value, b.select(reduce(b.or_, beyond), I64(FAR), I64(0)))
         self._store(found, j.points, b.mul(hit, I64(3)))
 
     def _by_ray(self, hit: Value, ray: Value) -> None:
@@ -110,8 +115,8 @@ class _Program:
         square = b.fadd(b.fadd(x, y), z)
         none = b.fcmp_ordered("==", square, self.number(0.0))
         length = e.lane(e.square_root(e.everywhere(b.select(none, self.number(1.0), square))), 0)
-        unknown = b.zext(b.fcmp_unordered("uno", square, square), I64)
-        self.met.value = b.or_(self.met.value, unknown)
+        unknown = b.fcmp_unordered("uno", square, square)
+        self.met.value = b.or_(self.met.value, b.select(unknown, I64(UNKNOWN), I64(0)))
         place = b.mul(ray, I64(3))
         self._store(self._load(j.points, b.mul(hit, I64(3)), I64(1)), j.ray_point, place)
         self._store(gradient, j.ray_gradient, place)

@@ -198,6 +198,10 @@ class Lanes:
         """A mask: a < b, false where either is NaN."""
         return self.builder.fcmp_ordered("<", a, b)
 
+    def mask(self, value: bool) -> Value:
+        """The same in every lane."""
+        return ir.Constant(ir.VectorType(I1, self.count), [value] * self.count)
+
     def both(self, a: Value, b: Value) -> Value:
         """A mask: where two masks hold."""
         return self.builder.and_(a, b)
@@ -390,6 +394,10 @@ class Lanes:
             product = self.builder.mul(product, factor)
         return product
 
+    def given(self, address: Value) -> Value:
+        """Whether an address is that of anything."""
+        return self.builder.icmp_unsigned("!=", self.builder.ptrtoint(address, I64), I64(0))
+
     def opaque(self, a: Value) -> Value:
         """The same integer, as if it came from nowhere: an empty piece of assembly that LLVM can't look into.
 
@@ -456,6 +464,7 @@ class Lanes:
     def reserve(self, element: ir.Type, count: int) -> Value:
         """Address of `count` elements on the stack; write this before any loop."""
         place = self.builder.alloca(element, count)
+        place.align = 64
         place.type = POINTER  # llvmlite still remembers what it points to; an address here is an address
         return place
 

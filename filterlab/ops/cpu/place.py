@@ -31,13 +31,13 @@ class Placing:
         self.dtype, self.lanes = dtype, lanes_of(dtype)
         self.placement = placement
         self.job = _job(placement)
-        self.run = self._program(signs=False)
+        self.run = self._program()
 
-    def _program(self, signs: bool) -> Function:
+    def _program(self) -> Function:
         geometry, boundary = self.placement.geometry, self.placement.boundary
         x, y, z = (_how_it_folds(boundary, n) for n in self.placement.size)
         affine = "identity" if geometry.is_identity else "full" if geometry.diagonal is None else "diagonal"
-        return compiler.compiled(FoldingVariant((x, y, z), affine, signs, ARITHMETIC[self.dtype], self.lanes))
+        return compiler.compiled(FoldingVariant((x, y, z), affine, ARITHMETIC[self.dtype], self.lanes))
 
     def __call__(self, points: Tensor) -> Placed:
         """(..., 3) to (located, sign)."""
@@ -49,13 +49,8 @@ class Placing:
         met = jobs[0].met
         if met & TURNED:
             sign = fresh(points.shape, self.dtype)
-            pool.run(self.turning, self.shared(points, located=located, signs=sign))
+            pool.run(self.run, self.shared(points, located=located, signs=sign))
         return self._with_lost(points, located, sign) if met & LOST else (located, sign)
-
-    @property
-    def turning(self) -> Function:
-        """The program that writes signs too."""
-        return self._program(signs=True)
 
     def shared(self, points: Tensor, **written: Tensor) -> list[FoldingJob]:
         """A job for every thread: all share the points, chunk by chunk. One reads in `met` what there was."""

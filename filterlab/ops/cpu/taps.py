@@ -186,7 +186,7 @@ class Lines:
         for pieces in self._pieces(plane_offset, needed, self.read_at_once):
             read = {lane: [self._read(taps[lane], piece) for piece in pieces] for lane in self._as_joined()}
             for i, piece in enumerate(pieces):
-                packs = self._transposed([read[lane][i] for lane in range(e.count)], len(piece.taps))
+                packs = packs_of_lines(e, [read[lane][i] for lane in range(e.count)], len(piece.taps))
                 found[piece.y] |= zip(piece.taps, (e.convert(p, self.storage) for p in packs), strict=True)
             yield from ((y, found.pop(y)) for y in list(found) if len(found[y]) == len(needed[y]))
 
@@ -198,15 +198,6 @@ class Lines:
         e, raw, count = self.lanes, self.storage.raw, len(piece.taps)
         address = self._address(tap, piece)
         return e.load(address, raw, count) if count <= 2 else e.load_quad(address, self.storage, count, self.room)
-
-    def _transposed(self, rows: list[Value], taps: int) -> list[Value]:
-        """Every lane's row of taps -> the first tap of every lane, the second of every lane, …"""
-        e = self.lanes
-        if taps == 1:
-            return [e.join(rows)]
-        if taps == 2:
-            return _transpose_pairs(e, [e.join(lanes_of_groups(rows, k)) for k in ((0, 1), (2, 3))])
-        return transpose_quads(e, [e.join(lanes_of_groups(rows, (k,))) for k in range(4)])[:taps]
 
     def add(
         self, taps: list[Value], plane_offset: Value, needed: dict[int, range], values: dict[int, list[Value]]
@@ -223,22 +214,11 @@ class Lines:
             for piece in pieces:
                 first = needed[piece.y].start
                 packs = values[piece.y][piece.taps.start - first : piece.taps.stop - first]
-                rows.append(self._lines_of_lanes(packs))
+                rows.append(lines_of_packs(e, packs))
             for lane, tap in enumerate(taps):
                 for piece, row in zip(pieces, rows, strict=True):
                     address = self._address(tap, piece)
                     e.store(b.fadd(e.load(address, e.number, row[lane].type.count), row[lane]), address)
-
-    def _lines_of_lanes(self, packs: list[Value]) -> list[Value]:
-        """The inverse of `_transposed`: for every lane a vector of its taps, and a 0 behind three of them."""
-        e, taps = self.lanes, len(packs)
-        if taps == 1:
-            return [e.shuffle(packs[0], packs[0], [i]) for i in range(e.count)]
-        if taps == 2:
-            joined = _interleave_pairs(e, packs)
-            return [e.shuffle(joined[i % 4 // 2], joined[i % 4 // 2], _places(i, 2)) for i in range(e.count)]
-        joined = transpose_quads(e, [*packs, *[e.constant(0)] * (4 - taps)])
-        return [e.shuffle(joined[i % 4], joined[i % 4], _places(i, 4)) for i in range(e.count)]
 
 
 class Taps:
@@ -430,6 +410,27 @@ def lanes_of_groups(vectors: list[Value], lanes: tuple[int, ...]) -> list[Value]
 def _in_groups(e: Lanes, a: Value, b: Value, pattern: Sequence[int]) -> Value:
     """A shuffle that does the same in every group: 0-3 are the lanes of a's group, 4-7 those of b's."""
     return e.shuffle(a, b, [g + k if k < 4 else e.count + g + k - 4 for g in range(0, e.count, 4) for k in pattern])
+
+
+def packs_of_lines(e: Lanes, lines: list[Value], taps: int) -> list[Value]:
+    """Every lane's line of up to four taps -> the first tap of every lane, the second of every lane, …"""
+    if taps == 1:
+        return [e.join(lines)]
+    if taps == 2:
+        return _transpose_pairs(e, [e.join(lanes_of_groups(lines, k)) for k in ((0, 1), (2, 3))])
+    return transpose_quads(e, [e.join(lanes_of_groups(lines, (k,))) for k in range(4)])[:taps]
+
+
+def lines_of_packs(e: Lanes, packs: list[Value]) -> list[Value]:
+    """The inverse: for every lane a vector of its taps, and a 0 behind three of them."""
+    taps = len(packs)
+    if taps == 1:
+        return [e.shuffle(packs[0], packs[0], [i]) for i in range(e.count)]
+    if taps == 2:
+        joined = _interleave_pairs(e, packs)
+        return [e.shuffle(joined[i % 4 // 2], joined[i % 4 // 2], _places(i, 2)) for i in range(e.count)]
+    joined = transpose_quads(e, [*packs, *[e.constant(0)] * (4 - taps)])
+    return [e.shuffle(joined[i % 4], joined[i % 4], _places(i, 4)) for i in range(e.count)]
 
 
 def transpose_quads(e: Lanes, rows: list[Value]) -> list[Value]:

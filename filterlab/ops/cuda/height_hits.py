@@ -21,7 +21,7 @@ from filterlab.ops.cuda.launch import interpreting, launchable
 from filterlab.ops.gather import in_whole_rows
 from filterlab.ops.height_hits import DEGREE, Cell, HeightHits, Pyramid, data_of_windows, slack_of
 from filterlab.ops.heights import Heights
-from filterlab.ops.raycast import Candidates, Written, written_in_parts
+from filterlab.ops.raycast import Candidates, Sheets, Written, written_in_parts
 from filterlab.volume import Boundary
 
 
@@ -55,6 +55,14 @@ def _first(given: HeightHits, asked: str, origins: Tensor, directions: Tensor) -
     return t
 
 
+def sheets(given: HeightHits, origins: Tensor, directions: Tensor, asked: Sheets) -> Tensor:
+    """`ops.reference.height_hits.sheets`, fused."""
+    t, count = asked.room(origins.shape[:-1], origins.device)
+    own = {"t": t, "count": count}
+    _cast(given, "sheets", origins, directions, own, asked.count, asked.most, asked.extent)
+    return asked.in_order(t, count)
+
+
 def candidates(given: HeightHits, origins: Tensor, directions: Tensor) -> Candidates:
     """`ops.reference.height_hits.candidates`, fused."""
 
@@ -67,16 +75,23 @@ def candidates(given: HeightHits, origins: Tensor, directions: Tensor) -> Candid
 
 
 def _cast(
-    given: HeightHits, asked: str, origins: Tensor, directions: Tensor, own: Mapping[str, Tensor], capacity: int = 0
+    given: HeightHits,
+    asked: str,
+    origins: Tensor,
+    directions: Tensor,
+    own: Mapping[str, Tensor],
+    capacity: int = 0,
+    most: int = 0,
+    extent: float = 0.0,
 ) -> None:
-    """Run a program for all rays; `own` is what it writes."""
+    """Run a program for all rays; `own` is what it writes, the rest as in `ops.cuda.height_rays`."""
     if not len(origins):
         return
     heights, pyramid = given.heights, given.pyramid
     arrays, sizes = _grid(heights, given.cell)
-    sizes |= {"rays": len(origins), "highest": pyramid.top, "capacity": capacity}
+    sizes |= {"rays": len(origins), "highest": pyramid.top, "capacity": capacity, "most": most}
     whole = {name: origins.new_tensor(x, dtype=torch.int64) for name, x in _levels(pyramid).items()}
-    rays = {"origins": origins, "directions": directions, "numbers": _numbers(given).to(origins.device)}
+    rays = {"origins": origins, "directions": directions, "numbers": _numbers(given, extent).to(origins.device)}
     arrays |= {"bounds": pyramid.numbers, **whole, **rays, **own}
     variant = HeightRaysVariant(asked, given.cell, heights.boundary is Boundary.ZEROS)
     program = _program(variant, interpreting())
@@ -91,9 +106,9 @@ def _levels(pyramid: Pyramid) -> dict[str, list[int]]:
     return {"starts": list(pyramid.starts[:-1]), "widths": [width for _, width in pyramid.sizes]}
 
 
-def _numbers(given: HeightHits) -> Tensor:
+def _numbers(given: HeightHits, extent: float) -> Tensor:
     heights, (end_x, end_y), (low_z, high_z) = given.heights, given.domain, given.pyramid.range
-    numbers = {"end_x": end_x, "end_y": end_y, "low_z": low_z, "high_z": high_z}
+    numbers = {"end_x": end_x, "end_y": end_y, "low_z": low_z, "high_z": high_z, "extent": extent}
     for a, origin, spacing in zip("xy", heights.origin, heights.spacing, strict=True):
         numbers |= {f"shift_{a}": origin, f"spacing_{a}": given.cell.steps * spacing}
     return torch.tensor([numbers[name] for name in NUMBERS], dtype=torch.float64)

@@ -20,13 +20,14 @@ from filterlab.ops.pieces import NO_MOTION
 from filterlab.ops.raycast import Written
 
 BLOCK = 32
-NUMBERS = ("shift_x", "shift_y", "spacing_x", "spacing_y", "end_x", "end_y", "low_z", "high_z")
-"""float64, in memory: of cells in the world; of the box around all, from (0, 0)."""
+NUMBERS = ("shift_x", "shift_y", "spacing_x", "spacing_y", "end_x", "end_y", "low_z", "high_z", "extent")
+"""float64, in memory: of cells in the world; of the box around all, from (0, 0); extent: its diagonal, in the world."""
 
 ARRAYS = (*height_cells.ARRAYS, "bounds", "starts", "widths", "origins", "directions", "numbers")
 """bounds: `ops.height_hits.Pyramid.numbers`; starts, widths: int64 of every level, the latter blocks of a row."""
 
-SIZES = ("width", "rays", "cells_x", "cells_y", "highest", "capacity")
+SIZES = ("width", "rays", "cells_x", "cells_y", "highest", "capacity", "most")
+"""capacity: candidates or sheets of a ray that there is room for; most: sheets behind which no more are looked for."""
 
 _ROWS = [f"row_{n}" for n in range(DEGREE + 1)]
 _INSIDE = ("u", "v", "w")
@@ -37,7 +38,7 @@ class HeightRaysVariant:
     """Everything the program depends on; can be hashed.
 
     Attributes:
-        asked: "first", "met" or "candidates".
+        asked: "first", "met", "sheets" or "candidates".
         cell: what the coefficients of a cell are made of.
         zeros: whether beyond the data there are zeros.
     """
@@ -48,8 +49,8 @@ class HeightRaysVariant:
 
     @property
     def own(self) -> tuple[str, ...]:
-        """Arrays that are written: t (R,); or those of `ops.raycast.Written`."""
-        return Written._fields if self.asked == "candidates" else ("t",)
+        """Arrays that are written: t (R,), or (R, k), and count (R,); or those of `ops.raycast.Written`."""
+        return {"sheets": ("t", "count"), "candidates": Written._fields}.get(self.asked, ("t",))
 
     def write(self) -> Source:
         return _Program(self).write()
@@ -67,7 +68,7 @@ class _Program:
         block, searching = self.source.block, f"going & ~{self.taker.waiting}"
         self._rays()
         self.taker.begin()
-        with block(f"while {any_of(searching)}"):
+        with self.taker.rounds(), block(f"while {any_of(searching)}"):
             self._next_cells(searching)
             with block(f"if {any_of('found')}"):
                 self._in_cells()
@@ -90,7 +91,8 @@ class _Program:
             self.line(f"{name} = tl.load(numbers + {k})")
         for k, a in enumerate("xyz"):
             self.line(f"own_{a} = tl.load(origins + 3 * ray + {k}, inside, 0.0).to(tl.float64)")
-            self.line(f"speed_{a} = tl.load(directions + 3 * ray + {k}, inside, 1.0).to(tl.float64)")
+            self.line(f"way_{a} = tl.load(directions + 3 * ray + {k}, inside, 1.0).to(tl.float64)")
+            self.line(f"speed_{a} = way_{a}")
         for a in "xy":
             self.line(f"own_{a}, speed_{a} = (own_{a} - shift_{a}) / spacing_{a}, speed_{a} / spacing_{a}")
         self.line("longest = tl.abs(speed_x)")
@@ -162,14 +164,14 @@ class _Program:
         for a in "xy":
             self.lines(f"""
                 plane = ((cell_{a} >> level) + forward_{a}) << level
-                way_{a} = (plane.to(tl.float64) - entry_{a}) / safe_{a}
-                way_{a} = tl.where(speed_{a} == 0.0, infinity, way_{a})
+                exit_{a} = (plane.to(tl.float64) - entry_{a}) / safe_{a}
+                exit_{a} = tl.where(speed_{a} == 0.0, infinity, exit_{a})
             """)
         self.lines(f"""
-            out = {smaller("way_x", "way_y")}
+            out = {smaller("exit_x", "exit_y")}
             out = {smaller("out", "end")}
             out = {larger("out", "s")}
-            along_y = way_y < way_x
+            along_y = exit_y < exit_x
             own = tl.maximum(level - {self.cell.finest}, 0)
             block = (cell_y >> level).to(tl.int64) * tl.load(widths + own) + (cell_x >> level) + tl.load(starts + own)
             bounded = on & (level >= {self.cell.finest})
@@ -183,21 +185,23 @@ class _Program:
     def _advance(self) -> None:
         """Who is `ahead` goes to the beginning of the next block."""
         self.line("leaves, fits = ahead & (ray < 0), ahead")
+        self.line(f"up = tl.where(level >= {self.cell.finest}, level + 1, {self.cell.finest})")
         for a, across in (("x", "~along_y"), ("y", "along_y")):
             self.lines(f"""
                 least = (cell_{a} >> level) << level
                 next_ = least + (1 << level)
-                most = tl.where(speed_{a} < 0.0, cell_{a}, tl.minimum(next_ - 1, cells_{a} - 1))
+                greatest = tl.where(speed_{a} < 0.0, cell_{a}, tl.minimum(next_ - 1, cells_{a} - 1))
                 place = tl.floor(out * speed_{a} + entry_{a}).to(tl.int32)
-                place = tl.minimum(tl.maximum(place, tl.where(forward_{a} > 0, cell_{a}, least)), most)
+                place = tl.minimum(tl.maximum(place, tl.where(forward_{a} > 0, cell_{a}, least)), greatest)
                 new = tl.where({across}, tl.where(forward_{a} > 0, next_, least - 1), place)
-                leaves = leaves | ((new >> (level + 1)) != (cell_{a} >> (level + 1)))
+                leaves = leaves | ((new >> up) != (cell_{a} >> up))
                 fits = fits & (new >= 0) & (new < cells_{a})
                 cell_{a} = tl.where(ahead, new, cell_{a})
             """)
-        self.lines("""
-            higher = tl.where(leaves, tl.minimum(level + 1, highest), level)
-            level = tl.where(ahead, higher, tl.where(down, level - 1, level))
+        self.lines(f"""
+            higher = tl.where(leaves, tl.minimum(up, highest), level)
+            lower = tl.where(level > {self.cell.finest}, level - 1, 0)
+            level = tl.where(ahead, higher, tl.where(down, lower, level))
             s = tl.where(ahead, out, s)
             going = going & (~ahead | (fits & (out < end)))
         """)
@@ -212,7 +216,7 @@ class _Program:
             self.lines(f"""
                 second = which == 1
                 piece_near, piece_far = tl.where(second, between, near), tl.where(second, far, between)
-                passed = found & tl.where(second, crossing <= far, crossing >= near) & ~{self.taker.waiting}
+                passed = found & tl.where(second, crossing <= far, crossing >= near) & ~{self.taker.done}
                 upper = upper_first != second
             """)
             for n, numbers in enumerate(zip(UPPER, LOWER, strict=True)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.gather import gather
 from filterlab.ops.differentiable.place import place
 from filterlab.ops.differentiable.recording import plain
-from filterlab.ops.place import Placed, Placement
+from filterlab.ops.place import InWorld, Placed, Placement
 from filterlab.ops.tetrahedra import AnyStencil
 
 if TYPE_CHECKING:
@@ -48,6 +49,19 @@ class Evaluation:
             return self._compiled(points)
         located, sign = place(points, self.placement, self.implementation)
         return gather(self.coefficients, located, self.stencil, self.start, self.implementation), sign
+
+    def in_world(self, points: Tensor, shape: Sequence[int], turned: bool = True) -> InWorld | None:
+        """(N, M, 3) -> value (N, C, M) and gradient (N, C, M, 3) per world unit, of a jet of order 1, in one pass.
+
+        None: rows are to be asked for. Something is recorded, it takes other steps, or plain torch.
+
+        Args:
+            shape: N C M numbers, as the values are wanted.
+            turned: whether points that `ops.place` would turn are right, too.
+        """
+        if self.implementation != "cpu" or not plain(self.coefficients, points):
+            return None
+        return (self._prepared.get(points.dtype) or self._prepare(points.dtype)).in_world(points, shape, turned)
 
     def of(self, coefficients: Tensor) -> Evaluation:
         """The same of other coefficients, on the same device, which lie as these do."""

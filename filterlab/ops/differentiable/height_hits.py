@@ -12,7 +12,7 @@ from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.gather import STORAGE
 from filterlab.ops.height_hits import Cell, HeightHits
 from filterlab.ops.heights import Heights
-from filterlab.ops.raycast import Candidates
+from filterlab.ops.raycast import Candidates, Sheets
 
 _FEWEST = 1 << 14
 """Cells from which on a program is worth to be compiled for their bounds."""
@@ -54,6 +54,13 @@ def first(given: HeightHits, origins: Tensor, directions: Tensor, implementation
 def met(given: HeightHits, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Tensor:
     """(R,) bool, whether rays (R, 3) meet the surface at all; arguments as for `first`."""
     return _driver(given, origins, implementation).met(given, origins, directions)
+
+
+def sheets(
+    given: HeightHits, origins: Tensor, directions: Tensor, asked: Sheets, implementation: str | None = None
+) -> Tensor:
+    """t (R, k) float64, where rays (R, 3) meet the surface; ∞ where they no longer do. Arguments as for `first`."""
+    return _driver(given, origins, implementation).sheets(given, origins, directions, asked)
 
 
 def candidates(given: HeightHits, origins: Tensor, directions: Tensor, implementation: str | None = None) -> Candidates:

@@ -10,15 +10,16 @@ from torch import Tensor
 from filterlab.ops import cpu
 from filterlab.ops.differentiable.drivers import driver
 from filterlab.ops.differentiable.recording import plain
-from filterlab.ops.hit_points import ByRays
+from filterlab.ops.hit_points import ByRays, OnRays
 from filterlab.ops.reference import hit_points as reference
 
 _COMPUTED = torch.float32, torch.float64
 
 
-def points(origins: Tensor, directions: Tensor, t: Tensor, index: Tensor) -> Tensor:
-    """o + t d (M, 3) of those rays (..., 3) that hit at t (...), by their flat places (M,) in t, ascending."""
-    return _driver(t, origins, directions).points(origins, directions, t, index)
+def points(origins: Tensor, directions: Tensor, t: Tensor, index: Tensor, reach: float) -> OnRays:
+    """o + t d (M, 3) of those rays (..., 3) that hit at t (...), by their flat places (M,) in t, ascending; whether any
+    of them begins farther away than `reach`."""
+    return _driver(t, origins, directions).points(origins, directions, t, index, reach)
 
 
 def by_rays(index: Tensor, shape: torch.Size, point: Tensor, gradient: Tensor) -> ByRays:

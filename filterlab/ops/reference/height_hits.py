@@ -15,9 +15,10 @@ from torch import Tensor
 from filterlab import bernstein
 from filterlab.ops.height_hits import DEGREE, ROUNDING, SMALLEST, Cell, HeightHits, Pyramid, enclose, slack_of
 from filterlab.ops.heights import Heights
-from filterlab.ops.raycast import Candidates, joined
+from filterlab.ops.raycast import Candidates, Sheets, joined
 from filterlab.ops.reference.heights import patches
 from filterlab.ops.reference.pieces import Lines, inside
+from filterlab.ops.reference.raycast import sheets_by
 from filterlab.roots import first_root
 
 RAYS_AT_ONCE = 1 << 16
@@ -85,6 +86,11 @@ def _first_of_part(given: HeightHits, origins: Tensor, directions: Tensor) -> Te
 def met(given: HeightHits, origins: Tensor, directions: Tensor) -> Tensor:
     """(R,) bool, whether rays (R, 3) meet the surface at all."""
     return first(given, origins, directions) < math.inf
+
+
+def sheets(given: HeightHits, origins: Tensor, directions: Tensor, asked: Sheets) -> Tensor:
+    """t (R, k) float64, where rays (R, 3) meet the surface, in order, or from the last on; ∞ behind the last."""
+    return sheets_by(lambda o, d: candidates(given, o, d), origins, directions, asked)
 
 
 def candidates(given: HeightHits, origins: Tensor, directions: Tensor) -> Candidates:
@@ -184,7 +190,8 @@ def walk(given: HeightHits, lines: Lines, take: Callable[[Pieces], Tensor]) -> N
             ended[here] = take(pieces)
         down = relevant & ~here
         on = _advanced(given, own, at, out, along_y)
-        at = _Places(*(torch.where(down, *both) for both in zip(at._replace(level=at.level - 1), on, strict=True)))
+        lower = torch.where(at.level > given.pyramid.finest, at.level - 1, 0)
+        at = _Places(*(torch.where(down, *both) for both in zip(at._replace(level=lower), on, strict=True)))
         inside_ = (at.x >= 0) & (at.x < given.heights.cells[0]) & (at.y >= 0) & (at.y < given.heights.cells[1])
         at = at.chosen(~ended & inside_ & (down | (out < own.far)))
 
@@ -241,7 +248,8 @@ def _advanced(given: HeightHits, lines: Lines, at: _Places, out: Tensor, along_y
         place = torch.minimum(torch.maximum(place, torch.where(step > 0, cell, low)), torch.where(step < 0, cell, high))
         across = torch.where(step > 0, low + (1 << at.level), low - 1)
         cells.append(torch.where(own, across, place))
-    up = at.level + 1
+    finest = given.pyramid.finest
+    up = torch.where(at.level >= finest, at.level + 1, finest)
     leaves = ((cells[0] >> up) != (at.x >> up)) | ((cells[1] >> up) != (at.y >> up))
     level = torch.where(leaves, up.clamp_max(given.pyramid.top), at.level)
     return at._replace(x=cells[0], y=cells[1], level=level, s=out)

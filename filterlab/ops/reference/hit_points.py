@@ -8,17 +8,18 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from filterlab.ops.hit_points import ByRays
+from filterlab.ops.hit_points import ByRays, OnRays
 
 
-def points(origins: Tensor, directions: Tensor, t: Tensor, index: Tensor) -> Tensor:
+def points(origins: Tensor, directions: Tensor, t: Tensor, index: Tensor, reach: float) -> OnRays:
     """o + t d (M, 3) of rays (..., 3) that hit at t (...).
 
     Args:
         index: (M,) int64, the flat places in t of those that do.
+        reach: the |o_k| of these rays from which on they are far.
     """
     o, d = chosen(index, t.shape, origins, directions)
-    return along(o, d, t.flatten().index_select(0, index))
+    return OnRays(along(o, d, t.flatten().index_select(0, index)), bool((o.detach().abs() > reach).any()))
 
 
 def by_rays(index: Tensor, shape: torch.Size, point: Tensor, gradient: Tensor) -> ByRays:
