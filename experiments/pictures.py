@@ -5,9 +5,9 @@ Letters: R rays, K cells of a ray, S steps of a march, N segments of each; T tra
 What is judged is what a picture shows, not its pixels: a pixel of a medium is a mean along its ray, in which errors
 cancel. It can be right where all that it shows is wrong.
 
-Half of the levels are drawn by volume: that much of the region is below them, and often they lie in what is nearly even.
-Half are drawn by detail, |∇f| dV, which is what the surfaces of all levels have of area (the coarea formula): they lie
-where the signal changes.
+Half of the levels are drawn by volume: that much of the region is below them, and often they lie in what is nearly
+even. Half are drawn by detail, |∇f| dV, which is what the surfaces of all levels have of area (the coarea formula):
+they lie where the signal changes.
 """
 
 from __future__ import annotations

@@ -37,18 +37,18 @@ WORDS = {
     "sure": "the same: no interval holds the budget (not undecided)",
     "near": f"the pick costs at most {FACTOR} × the cheapest that meets the budget",
 }
-PICTURED_BARS = {"kept": 0.95, "rendered": 0.95, "justified": 0.95, "sure": 0.95, "elsewhere": None}
+PICTURED_BAR = 0.95
 PICTURED_WORDS = {
     "kept": "the pick keeps the budget",
-    "rendered": "the picture of the pick, beside that of the signal, does: RMS of pixels",
+    "rendered": "so does its rendered picture, by the RMS of pixels",
     "justified": "nothing was picked, and nothing meets the budget",
-    "sure": "the same: no interval holds the budget (not undecided)",
+    "sure": "the same: not undecided",
     "elsewhere": "where something does: nothing does over the region",
 }
 SHOWN = {
     "volume": "Such a level lies anywhere, and often in what is nearly even: less is wrong there than over the region, "
     "of which refusals speak.",
-    "detail": "Such a level lies where the signal changes: there more is wrong than over the region, of which picks "
+    "detail": "Such a level lies where the signal changes: more is wrong there than over the region, of which picks "
     "speak.",
 }
 TITLES = (
@@ -171,19 +171,20 @@ def _in_pictures(volumes: Sequence[Record], task: str, level: str) -> Table:
         for half in HALVES
         for near in (False, True)
     }
-    columns = [Column("", numeric=False), Column("asked for")]
-    columns += [Column(f"{half}, {'near true errors' if near else 'as people ask'}") for half, near in kinds]
+    columns = [Column("", numeric=False), *(Column(f"{half}, near" if near else half) for half, near in kinds)]
     rows = [
         [
             words,
-            MISSING if bar is None else f"≥ {100 * bar:.0f} %",
             *(_rate(held[name]) for held in kinds.values()),
-            _met(kinds[HALVES[1], False][name], bar),
+            _met(kinds[HALVES[1], False][name], None if name == "elsewhere" else PICTURED_BAR),
         ]
-        for (name, words), bar in zip(PICTURED_WORDS.items(), PICTURED_BARS.values(), strict=True)
+        for name, words in PICTURED_WORDS.items()
         if name != "rendered" or task == "dvr"
     ]
-    caption = f"Task {task}, by what pictures show of levels drawn by {level}. {SHOWN[level]}"
+    caption = (
+        f"Task {task}, by what pictures show of levels drawn by {level}. {SHOWN[level]} Near: of budgets near the true "
+        f"errors. The last column judges the reporting half, budgets as people ask, by {100 * PICTURED_BAR:.0f} %."
+    )
     return Table([*columns, Column("")], rows, caption)
 
 
