@@ -21,11 +21,14 @@ from benchmarks.settings import Settings
 from filterlab.names import SPLINES
 from filterlab.ops.differentiable import height_hits
 from filterlab.ops.differentiable import heights as jets
+from filterlab.ops.raycast import Sheets
+from filterlab.ops.reference.raycast import sheets_by
 from filterlab.render import PerspectiveCamera
 from filterlab.surfaces import HeightField
 
 _HEIGHT, _ROUGHNESS = 0.12, 0.55  # of the largest hills, in edges of the square; of every octave, of the one before
 _PLAIN = 64  # pixels along an edge of what plain torch casts
+_GRAZING, _SHEETS = 10.0, 8  # degrees, hits of a ray
 _COARSE = (25, 49, 97, 193)  # data along an edge of the splines whose errors triangles are given
 _AROUND = 3  # data beyond every edge that they have
 _SITES = 200  # along an edge, at which errors are measured
@@ -160,6 +163,29 @@ def _plain(settings: Settings) -> Race:
     return Race(what, contestants, ratios)
 
 
+def _sheets(settings: Settings) -> Race:
+    """All that grazing rays hit: by one program, by plain torch from the pieces that a program finds, by it alone."""
+    heights, rays = hills(size_of(settings) // 2), view(min(_PLAIN, settings.image), _GRAZING)
+    origins, directions = (x.reshape(-1, 3) for x in rays)
+    contestants, ratios = [], []
+    for spline in SPLINES:
+        surface = ground(heights, spline)
+        given, asked = surface.cast, Sheets(_SHEETS, False, surface.domain.diagonal)
+        pieces = partial(height_hits.candidates, given, implementation="cpu")
+        ways: dict[str, Callable[[], Any]] = {
+            "fused": partial(height_hits.sheets, given, origins, directions, asked, "cpu"),
+            "plain roots": partial(sheets_by, pieces, origins, directions, asked),
+            "plain": partial(height_hits.sheets, given, origins, directions, asked, "reference"),
+        }
+        for way, call in ways.items():
+            shown = lambda t: Casting.summary(t.numpy())  # noqa: E731
+            contestants.append(Contestant(f"{spline}, {way}", call, f"{spline} sheets", shown, len(origins)))
+        fused, *others = (f"{spline}, {way}" for way in ways)
+        ratios += [Ratio(fused, other, at_most("1/30") if other == others[-1] else None) for other in others]
+    what = f"{len(heights)}² data, {len(origins):,} rays from {_GRAZING:g}° above the horizon: {_SHEETS} sheets"
+    return Race(what, contestants, ratios)
+
+
 def _growth(settings: Settings) -> Race:
     """Twice as many data along an edge."""
     rays, size = view(2 * settings.image), size_of(settings)
@@ -198,6 +224,7 @@ def _items(settings: Settings) -> list[Item]:
         race_item("first", 30, _first),
         race_item("equal-error", 30, _equal_error),
         race_item("plain", 60, _plain),
+        race_item("sheets", 60, _sheets),
         race_item("size", 10, _growth),
         race_item("scattered", 20, partial(_jets, transposed=False)),
         race_item("scattered-transpose", 20, partial(_jets, transposed=True)),

@@ -57,6 +57,11 @@ class Hits:
         """(...) bool."""
         return self.t.detach() < torch.inf
 
+    def places(self) -> Tensor:
+        """(M,) int64, the flat places in t of rays that hit, ascending; `valid` need not be made for it."""
+        t = self.t.detach()
+        return torch.from_numpy(np.flatnonzero(t.numpy() < np.inf)) if t.device.type == "cpu" else _where(self.valid)
+
     def where(self, kept: Tensor) -> Hits:
         """Those of a mask that broadcasts to (...), none elsewhere."""
         piece = None if self.piece is None else torch.where(kept, self.piece, -1)
@@ -224,7 +229,7 @@ class Surface(ABC):
             raise ValueError(f"hits of rays {tuple(rays)} have t of that shape, or (..., k); got {tuple(shape)}")
         if self.in_pieces and hit.piece is None:
             raise ValueError(f"hits of {type(self).__name__} tell which piece is hit; got hits with piece=None")
-        index = _where(hit.valid)
+        index = hit.places()
         if order == 1 and self._is_plain(origins, directions, hit):
             found = self._at_once(origins, directions, hit, index)
             if found is not None:
@@ -299,7 +304,7 @@ class Surface(ABC):
         """The same hits, with derivatives."""
         if not torch.is_grad_enabled() or not (transforming() or self._asked(origins, directions)):
             return hit
-        index = _where(hit.valid)
+        index = hit.places()
         if not len(index) or not self._follows(index[:1], hit, origins, directions):
             return hit
         o, d = chosen(index, hit.t.shape, origins, directions)

@@ -47,14 +47,17 @@ class RootsVariant:
             own = e.advance(told.rows, b.mul(chunk, I64((n + 1) * self.lanes)), number)
             rows = [e.load(e.advance(own, I64(i * self.lanes), number), number, self.lanes) for i in range(n + 1)]
             left.value, rank.value = whole, I64(0)
-            search.begin(left.value, rows, e.constant(1))
+            tiny = float(np.finfo(self.arithmetic).tiny)
+            ends = b.fcmp_ordered("==", rows[-1], e.constant(tiny))
+            search.begin(left.value, rows, e.constant(1), ends)
             with e.repeat_while(lambda: e.any(left.value)):
                 found, over = search.next_part(left.value, lambda *own: part.assign(e, *own))
                 within = search.root([r.value for r in part.rows], found)
                 t = e.multiply_add(within, part.h.value, part.a.value)
                 place = b.add(b.mul(chunk, I64(n + 2)), rank.value)
                 place = e.advance(told.t, b.mul(place, I64(self.lanes)), number)
-                e.store(e.where(found, t, e.constant(float("inf"))), place)
+                at_end = b.and_(b.and_(over, ends), b.and_(search.above(), b.not_(found)))
+                e.store(e.where(found, t, e.where(at_end, e.constant(1), e.constant(float("inf")))), place)
                 left.value, rank.value = b.and_(left.value, b.not_(over)), b.add(rank.value, I64(1))
         b.ret_void()
         return str(module)
@@ -101,6 +104,18 @@ def test_every_root_in_order(degree, arithmetic):
     found = roots_of(c.astype(arithmetic))
     for own, known in zip(found, roots, strict=True):
         assert own == pytest.approx(sorted(r for r in known if r < 1), abs=1e-9 if arithmetic == "float64" else 2e-2)
+
+
+@pytest.mark.parametrize("near", [1e-1, 1e-3, 1e-6, 1e-9])
+def test_a_root_at_the_end_is_met_behind_those_before_it(near):
+    """From above, behind a root from below in the same part, however near that is; from below it is found as others."""
+    roots = [[0.3, 0.7], [0.3, 1 - near], [0.8, 1.6], [1.3, 1.7]]
+    c = np.stack([bernstein(np.array([*own, 1.0])) for own in roots])
+    c *= np.sign(c[:, :1])
+    assert (np.abs(c[:, -1]) < 1e-16).all()
+    c[:, -1] = np.finfo(float).tiny
+    for own, known in zip(roots_of(c), roots, strict=True):
+        assert own == pytest.approx([r for r in [*known, 1.0] if r <= 1], abs=1e-7)
 
 
 @pytest.mark.parametrize("degree", [2, 3, 4, 6])

@@ -97,7 +97,7 @@ class EveryRoot:
         self._begins.value = b.and_(signs.begins, b.not_(b.and_(repeated, at_zero)))
         self._left.value = b.or_(signs.simple, signs.hard)
         with b.if_then(e.any(signs.hard), likely=False):
-            self.search.begin(signs.hard, signs.rows, e.where(at_zero, zero, e.constant(1)))
+            self.search.begin(signs.hard, signs.rows, e.where(at_zero, zero, e.constant(1)), ends)
         with e.repeat_while(lambda: e.any(self._left.value)):
             self._round(signs, ends)
 

@@ -252,10 +252,14 @@ class NextRoots(FirstRoot):
         with lanes.builder.goto_entry_block():
             self._rows, self._lowered, self._raised = ([lanes.kept() for _ in range(degree + 1)] for _ in range(3))
         self._a, self._h, self._side, self._until = (lanes.variable(zero) for _ in range(4))
+        self._ends = lanes.variable(none)  # a root is where [0, 1] ends
         self._counted = lanes.variable(none)  # the root where this side is left was told of; it is left by `_until`
 
-    def begin(self, mask: Value, rows: Rows, side: Value) -> None:
-        """Of polynomials under the mask, which begin on a side; those of others are forgotten."""
+    def begin(self, mask: Value, rows: Rows, side: Value, ends: Value) -> None:
+        """Of polynomials under the mask, which begin on a side; those of others are forgotten.
+
+        `ends`, a mask: p(1) is 0, and stands among the rows as the smallest number.
+        """
         e = self.lanes
         for kept, numbers in (
             (self._rows, rows),
@@ -264,7 +268,7 @@ class NextRoots(FirstRoot):
         ):
             for pack, number in zip(kept, numbers, strict=True):
                 pack.set_part(I64(0), number)
-        self._a.value, self._h.value, self._side.value = e.constant(0), e.constant(1), side
+        self._a.value, self._h.value, self._side.value, self._ends.value = e.constant(0), e.constant(1), side, ends
         self._counted.value = ir.Constant(mask.type, None)
 
     def above(self) -> Value:
@@ -297,6 +301,8 @@ class NextRoots(FirstRoot):
         not_above = self.negative(self._on(self._lowered, a, end))
         not_below = [b.fcmp_ordered(">=", r, zero) for r in self._on(self._raised, a, end)]
         many = [b.not_(self.at_most_one(self.changes(flags))) for flags in (not_above, not_below)]
+        rises = b.and_(b.not_(not_below[0]), not_below[-2])  # before the end, at which it then comes from above
+        many[1] = b.or_(many[1], b.and_(rises, b.and_(self._ends.value, b.fcmp_ordered(">=", end, one))))
         above, between = b.fcmp_ordered(">", side, zero), b.fcmp_ordered("==", side, zero)
         several, leaves = b.select(above, *many), b.select(above, not_above[-1], not_below[-1])
         holds = b.and_(b.and_(left, b.not_(b.or_(between, counted))), b.select(several, narrow, leaves))

@@ -170,7 +170,7 @@ class Sheets(Located):
             taken = holds
         """)
         with block(f"if {any_of('hard')}"):
-            self.search.start("tl.where(at_zero, nothing, nothing + 1.0)")
+            self.search.start("tl.where(at_zero, nothing, nothing + 1.0)", "on_end")
         with block(f"while {any_of('taken')}"):
             with block(f"if {any_of('hit & taken')}"):
                 self._write()

@@ -214,13 +214,14 @@ class NextRoots(FirstRoot):
 
     def begin(self) -> None:
         super().begin()
-        self.start("nothing")
+        self.start("nothing", "(ray < 0)")
 
-    def start(self, side: str) -> None:
-        """Of other polynomials, which begin on a side."""
+    def start(self, side: str, ends: str) -> None:
+        """Of other polynomials, which begin on a side; `ends`: p(1) is 0, and stands as the smallest number."""
         self.source.lines(f"""
             sweep_a, sweep_h, sweep_parts, until = nothing, nothing + 1.0, nothing + 1.0, nothing
             side = {side}
+            sweep_ends = {ends}
             counted = inside & (ray < 0)
         """)
 
@@ -250,6 +251,8 @@ class NextRoots(FirstRoot):
             self.count_changes(self._between("here", own, "sweep_a", "end_"))
             self.line(f"often_{name}, not_{name} = changes > 1, below")
         self.source.lines(f"""
+            rises = (here_0 > 0.0) & (here_{self.degree - 1} <= 0.0)  # before the end, at which it is from above
+            often_below_ = often_below_ | (rises & sweep_ends & (end_ >= 1.0))
             narrow = sweep_h <= {number(self.eps)}
             several = tl.where(side > 0.0, often_above, often_below_)
             leaves = tl.where(side > 0.0, not_above, not_below_)
