@@ -10,6 +10,7 @@ import torch
 
 from filterlab.ops.differentiable import height_hits as ops
 from filterlab.ops.raycast import Sheets
+from filterlab.ops.reference import height_hits as reference
 from filterlab.surfaces import HeightField
 from tests import laws
 from tests.height_ray_oracle import NAMES, STEPS, Ground, crossings
@@ -88,19 +89,19 @@ def test_the_program_finds_what_plain_torch_finds(kind):
     assert int((ones != others).sum()) <= (0.2 * 200 if kind in ("at heights of vertices", "stairs") else 4)
 
 
-@every_kind
+@pytest.mark.parametrize("kind", ["horizontal", "vertical", "at heights of vertices", "stairs", "holes"])
 def test_the_program_finds_the_sheets_that_plain_torch_finds(kind):
     """As many, in the same places, in the same order, however many are asked for; the first one is the first hit."""
-    name = NAMES[(list(CLASSES).index(kind) + 1) % len(NAMES)]
+    name = NAMES[list(CLASSES).index(kind) % len(NAMES)]
     boundary, diagonal, seed = turn(name, kind)
     case, rng = case_of(name, kind, boundary, diagonal, seed)
-    rays = [torch.from_numpy(x) for x in CLASSES[kind][1](rng, case, 130)]
+    rays = [torch.from_numpy(x) for x in CLASSES[kind][1](rng, case, 60)]
     given, extent = case.surface.cast, case.surface.domain.diagonal
     plain, fused = (ops.sheets(given, *rays, Sheets(40, False, extent), how) for how in ("reference", "cpu"))
     same = ((plain < torch.inf) == (fused < torch.inf)).all(1)
     apart = torch.where(plain == fused, 0, (plain - fused).abs())[same].amax(1) * rays[1][same].norm(dim=1)
-    touching = 20 if kind == "at heights of vertices" else 2  # rays that touch within rounding
-    assert int((~same).sum()) + int((apart > (1e-6 if kind == "from far away" else 1e-9)).sum()) <= touching
+    touching = 10 if kind == "at heights of vertices" else 2  # rays that touch within rounding
+    assert int((~same).sum()) + int((apart > 1e-9).sum()) <= touching
     assert bool((fused[:, -1] == torch.inf).all())
     assert torch.equal(fused[:, 0], ops.first(given, *rays, "cpu"))
     last = [torch.cat((t[t < torch.inf].flip(0), t[t == torch.inf])) for t in fused]
@@ -112,11 +113,11 @@ def test_the_program_finds_the_sheets_that_plain_torch_finds(kind):
 
 def test_sheets_of_float32_rays_on_threads_are_those_of_each_ray_alone(monkeypatch):
     case, rng = case_of("c1", "horizontal", "mirror", "main", 5)
-    o, d = (torch.from_numpy(x).float() for x in CLASSES["horizontal"][1](rng, case, 67))
+    o, d = (torch.from_numpy(x).float() for x in CLASSES["horizontal"][1](rng, case, 23))
     given, asked = case.surface.cast, Sheets(3, False, 40.0)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     found = ops.sheets(given, o, d, asked, "cpu")
-    assert int((found < torch.inf).sum()) > 67
+    assert int((found < torch.inf).sum()) > 23
     alone = [ops.sheets(given, *rays, asked, "cpu") for rays in zip(o.split(1), d.split(1), strict=True)]
     assert torch.equal(found, torch.cat(alone))
     assert torch.equal(found, ops.sheets(given, o.double(), d.double(), asked, "cpu"))
@@ -147,6 +148,20 @@ def test_a_picture_has_no_cracks(name):
     seen = ((inner > 0) & (inner < 45)).all(-1)
     assert bool((surface.hit(eye, aim - eye).t < torch.inf)[seen].all())
     assert bool((surface.hit(eye.float(), (aim - eye).float()).t < torch.inf)[seen].all())
+
+
+@pytest.mark.parametrize("name", ["linear", "c0", "c2"])
+def test_a_ray_leaves_cells_for_blocks_again(name, monkeypatch):
+    """Past the foot of a hill, over a plain of 480 data: not cell by cell, whatever the smallest blocks are."""
+    heights = torch.zeros(501, 501, dtype=F64)
+    heights[240:260, 10:20] = 1.0
+    heights[240:260, 480:490] = 1.0
+    steps, relevant = [], reference._relevant
+    monkeypatch.setattr(reference, "_relevant", lambda *given: steps.append(given) or relevant(*given))
+    o, d = torch.tensor([[19.5, 250.3, 0.9]], dtype=F64), torch.tensor([[1.0, 0.01, 0.0]], dtype=F64)
+    t = ops.first(HeightField(heights, name).cast, o, d, "reference")
+    assert 450 < float(t) < 475
+    assert len(steps) < 90
 
 
 @pytest.mark.parametrize("name", ["linear", "c1"])
