@@ -40,7 +40,8 @@ class Signal(Field):
 
     Args:
         name: what error messages and reports call it.
-        value_and_gradient: points `(..., 3)` -> (value `(...)`, exact gradient `(..., 3)`), differentiable torch code.
+        value_and_gradient: points `(..., 3)` -> (value `(...)`, exact gradient `(..., 3)`), differentiable torch code; of
+            whatever type, jets are of that of the points.
         lower, upper: corners of the box it is looked at in, x, y, z.
         voxel_size: nominal voxel edge, the unit of a renderer's step; default 1/64 of the longest edge of the box.
         degree: in x, y and z together, if it is a polynomial.
@@ -147,9 +148,14 @@ class Signal(Field):
         check_order(order, self.max_order)
         points = check_points(points, None)
         if order == 2:
-            value, gradient = self._function(points)
-            return value, gradient, _jacobian(lambda p: self._function(p)[1], points)
-        return self._function(points)[: order + 1]
+            value, gradient = self._at(points)
+            return value, gradient, _jacobian(lambda p: self._at(p)[1], points)
+        return self._at(points)[: order + 1]
+
+    def _at(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """In the type of the points, whatever the function computes in."""
+        value, gradient = self._function(points)
+        return value.to(points.dtype), gradient.to(points.dtype)
 
     def sample(
         self,

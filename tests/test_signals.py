@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from filterlab import signals
+from filterlab.render import PerspectiveCamera, TransferFunction, render
 from tests import laws
 
 every_signal = pytest.mark.parametrize("name", signals.SIGNALS)
@@ -145,6 +146,20 @@ def test_shapes_dtypes_and_voxel_size(name):
     assert signal(torch.zeros(3, dtype=torch.int64)).dtype == torch.float32
     assert signal.with_voxel_size(0.25).domain.voxel_size == 0.25
     assert "voxel_size" in inspect.signature(signals.SIGNALS[name]).parameters
+
+
+def test_a_function_may_give_views_of_another_type():
+    def ramp(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        x = torch.stack([points.double()[..., 0], points.double()[..., 1]], -1)
+        return x[..., 0], torch.zeros_like(points, dtype=torch.float64) + torch.tensor([1.0, 0, 0])
+
+    signal = signals.Signal("ramp", ramp)
+    value, gradient, hessian = signal.jet(torch.rand(5, 3), 2)
+    assert {value.dtype, gradient.dtype, hessian.dtype} == {torch.float32}
+    transfer = TransferFunction([-1.0, 0.0, 1.0], [[0.0, 0, 0], [1, 0, 0], [1, 1, 1]], [0.0, 0.3, 0.5])
+    image = render(signal, PerspectiveCamera.framing(signal.domain), transfer, size=(8, 8), step=0.2)
+    assert image.dtype == torch.float32
+    assert image.isfinite().all()
 
 
 def test_callers_mistakes():
