@@ -37,9 +37,9 @@ _FEW = 100  # hits, or rays, that say nothing
 _FAINT = 0.02  # opacity of a ray on which hardly anything is seen
 _WIDTHS = 0.03, 1.0  # of a medium, in parts of the range, log-uniform
 _DENSITIES = 0.02, 0.9  # the largest opacity of a voxel, log-uniform
-_CELL, _CELLS = 1 / 16, 2**19  # voxels long, about; in all
+_CELL, _CELLS = 1 / 8, 2**18  # voxels long, about; in all
 _DRAWN = 2**11  # N
-_NODES = 8  # of the mean over a segment
+_NODES = 5  # of the mean over a segment
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
 

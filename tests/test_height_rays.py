@@ -89,6 +89,22 @@ def test_the_program_finds_what_plain_torch_finds(kind):
     assert int((ones != others).sum()) <= (0.2 * 200 if kind in ("at heights of vertices", "stairs") else 4)
 
 
+@pytest.mark.parametrize(("name", "turned"), [("c1", False), ("linear", True)])
+def test_rays_that_rest_on_their_way_find_the_same(name, turned):
+    """Of so many blocks along an axis that rays wait for bounds, on their way down the pyramid."""
+    length, generator = 2100, torch.Generator().manual_seed(3)
+    heights = 20 * torch.rand(9, length, generator=generator, dtype=F64) + 40 * (torch.arange(length) / 90.0).sin()
+    surface = HeightField(heights.T.contiguous() if turned else heights, name)
+    assert surface.cast.pyramid.top - surface.cast.cell.finest >= 10
+    ends = torch.rand(2, 40, 3, generator=generator, dtype=F64)
+    ends[:] *= torch.tensor([length - 1.0, 8, 1], dtype=F64)
+    ends[0, :, 2] += 100
+    origins, targets = ends[..., [1, 0, 2]] if turned else ends
+    plain, fused = (ops.first(surface.cast, origins, targets - origins, how) for how in ("reference", "cpu"))
+    assert int((plain < torch.inf).sum()) > 15
+    torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("kind", ["horizontal", "vertical", "at heights of vertices", "stairs", "holes"])
 def test_the_program_finds_the_sheets_that_plain_torch_finds(kind):
     """As many, in the same places, in the same order, however many are asked for; the first one is the first hit."""

@@ -154,6 +154,12 @@ def recommend(
     draw 500 of 505 picks kept their budgets. Where nothing was picked though an interval holds the budget, the answer
     is `undecided`; else nothing met it in 99.7 %.
 
+    A picture sees a part of the region, where errors may be larger, as on an edge, or smaller, as in what is nearly
+    even: in pictures of 461 volumes 95.2 % of picks for dvr and 93.3 % of those for isosurfaces kept their budgets, and
+    nothing met the budget after 96.5 and 93.5 % of refusals that were not undecided (`docs/recommend.md`). The loss of
+    a march is that of the value: in a medium of optical depth τ per voxel a pixel moves by another τ s² / 12 times the
+    slope along its ray, since the front of a segment hides its back. No transfer function is known here.
+
     Args:
         volume: a `Volume` or a bare tensor.
         max_error: the budget, as a fraction: 0.005 is half a percent.

@@ -198,6 +198,14 @@ def test_pictures_are_compared_pixel_by_pixel() -> None:
     assert cloud.rendered(half, 0.35) == pytest.approx(0.1 * opacity * math.sqrt(7 / 15), rel=0.02)
 
 
+def test_in_a_dense_medium_the_front_of_a_segment_hides_its_back() -> None:
+    """A ramp of slope 1: a step s moves what is seen by 1/τ − s / (e^(τ s) − 1) − s/2, about τ s²/12, to the back."""
+    cloud, tau = cloud_of(replace(through(ramp), span=16.0), constant(0.7)), -math.log1p(-0.7)
+    moved = [1 / tau - s / math.expm1(tau * s) - s / 2 for s in (1.0, 0.25)]
+    assert moved[0] == pytest.approx(-tau / 12, rel=0.03)
+    assert 16 * cloud.rendered(cloud.picture.signal, 1.0) == pytest.approx(moved[1] - moved[0], rel=0.002)
+
+
 def test_media_lie_around_the_level() -> None:
     random = np.random.default_rng(2)
     for _ in range(30):

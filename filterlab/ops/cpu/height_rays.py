@@ -4,7 +4,8 @@ For P rays in turn, as `ops.height_hits` says:
 
     walk        from block to block, up and down the pyramid, in integers: no rounding can lose a ray or stop it. Some
                 rays come to the first cell that they may hit something in before the first of them goes on: of a large
-                grid the data of all are then on their way from memory. Bounds are asked for on the way down
+                grid the data of all are then on their way from memory. Bounds are asked for on the way down; of a deep
+                pyramid rays rest above the smallest blocks, until the others have come so far too
     restrict    in a cell the quartics of both triangles at once: lanes are (upper p, upper q, lower p, lower q), where
                 a step of de Casteljau's algorithm to p is one to q, or to the other of both, in every lane
     signs       no change of sign: on. One: there is the hit, the ray waits for the others
@@ -40,6 +41,10 @@ PACKS_OF_A_CHUNK = 16
 AHEAD = 16  # rays that come to their first cells before the first of them is restricted to one
 _N = DEGREE + 1
 _LEVELS_AHEAD = 2  # at which bounds are asked for where a line goes down
+_RESTING = 3  # levels above the smallest blocks, where lines rest
+_RESTS = 3  # of a line, at most, before its first cell
+_DEEP = 10  # levels above the smallest blocks, from which on caches do not hold the bounds
+_NUMBERS = 9  # doubles of a line
 _NOTHING, _INNER, _AT_START, _AT_END = range(4)
 
 # Arrays are contiguous; R rays, d a double.
@@ -119,8 +124,31 @@ class _Line:
     forward: list[Value]
     meets: Value
 
+    @property
+    def numbers(self) -> list[Value]:
+        """All doubles."""
+        return [*self.origin, *self.direction, self.start, self.far, self.length]
+
     def at(self, e: Lanes, axis: int, s: Value) -> Value:
         return e.multiply_add(s, self.direction[axis], self.origin[axis])
+
+
+class _Kept:
+    """Values of some kinds, of every line that is underway."""
+
+    def __init__(self, lanes: Lanes, kinds: Sequence[ir.Type]) -> None:
+        self.lanes, self.builder, self.kinds = lanes, lanes.builder, kinds
+        self.arrays = [lanes.reserve(kind, AHEAD) for kind in kinds]
+
+    def _places(self, place: Value) -> list[Value]:
+        return [self.lanes.advance(own, place, kind) for own, kind in zip(self.arrays, self.kinds, strict=True)]
+
+    def write(self, place: Value, values: Sequence[Value]) -> None:
+        for address, value in zip(self._places(place), values, strict=True):
+            self.builder.store(value, address)
+
+    def read(self, place: Value) -> list[Value]:
+        return [self.builder.load(own, typ=kind) for own, kind in zip(self._places(place), self.kinds, strict=True)]
 
 
 class _Program:
@@ -139,19 +167,25 @@ class _Program:
         self.level, self.going = e.variable(I64(0)), e.variable(I1(0))
         self.s, self.ended_at, self.ended_with = (e.variable(DOUBLE(0.0)) for _ in range(3))
         self.relevant, self.on, self.arrived = (e.variable(I1(0)) for _ in range(3))
-        self.first_cells, self.first_s = e.reserve(I64, 2 * AHEAD), e.reserve(DOUBLE, AHEAD)
-        self.arrivals = e.reserve(I1, AHEAD)
+        self.resting = e.variable(I64(0))
+        self.lines, self.states = _Kept(e, [DOUBLE] * _NUMBERS), _Kept(e, [I64, I64, DOUBLE, I64, I1])
 
     def write(self) -> None:
         e, b, j = self.lanes, self.builder, self.job
         self.prepare()
+        deep = b.icmp_signed(">=", b.sub(j.top, I64(self.cell.finest)), I64(_DEEP))
+        rests = b.select(deep, I64(_RESTS), I64(0))
         with frame.every_chunk(e, j) as chunk:
             begin = b.mul(chunk, I64(LANES * PACKS_OF_A_CHUNK))
             end = e.smaller(b.add(begin, I64(LANES * PACKS_OF_A_CHUNK)), j.rays)
             with e.repeat(begin, end, AHEAD) as ahead:
                 last = e.smaller(b.add(ahead, I64(AHEAD)), end)
                 with e.repeat(ahead, last) as number:
-                    self._approach(self._line(number), b.sub(number, ahead))
+                    self._enter(number, b.sub(number, ahead))
+                with e.repeat(I64(0), b.add(rests, I64(1))) as turn:
+                    level = b.select(b.icmp_signed("<", turn, rests), I64(self.cell.finest + _RESTING), I64(-1))
+                    with e.repeat(ahead, last) as number:
+                        self._approach(number, b.sub(number, ahead), level)
                 with e.repeat(ahead, last, LANES) as first:
                     self.begin()
                     with e.repeat(first, e.smaller(b.add(first, I64(LANES)), last)) as number:
@@ -224,43 +258,66 @@ class _Program:
         """|a| of one double."""
         return self.lanes.maximum(a, self.builder.fneg(a))
 
-    def _approach(self, line: _Line, place: Value) -> None:
-        """Down to the first cell in which a line may meet something; the data of that are asked for."""
-        e, b, j = self.lanes, self.builder, self.job
+    def _enter(self, number: Value, place: Value) -> None:
+        """A line before its first step."""
+        j, line = self.job, self._line(number)
+        self.lines.write(place, line.numbers)
         for own, x, count in zip(self.cell_at, line.origin[:2], (j.cells_x, j.cells_y), strict=True):
-            own.value = self._cell_of(x, I64(0), b.sub(count, I64(1)))
-        self.level.value, self.s.value = j.top, DOUBLE(0.0)
-        self.going.value, self.arrived.value = line.meets, I1(0)
-        with e.repeat_while(lambda: self.going.value):
-            self._step(line, self._arrive)
-        for address, value in zip(self._kept(place), self._found(), strict=True):
-            b.store(value.value, address)
+            own.value = self._cell_of(x, I64(0), self.builder.sub(count, I64(1)))
+        self.level.value, self.s.value, self.arrived.value = j.top, DOUBLE(0.0), line.meets
+        self._keep(place)
+
+    def _entered(self, number: Value, place: Value) -> _Line:
+        """A line again, that has got somewhere."""
+        b, numbers = self.builder, self.lines.read(place)
+        direction, (start, far, length) = numbers[3:6], numbers[6:]
+        forward = [b.zext(b.fcmp_ordered(">", d, DOUBLE(0.0)), I64) for d in direction[:2]]
+        return _Line(number, numbers[:3], direction, start, far, length, forward, I1(1))
+
+    def _state(self) -> list[Variable]:
+        return [*self.cell_at, self.s, self.level, self.arrived]
+
+    def _keep(self, place: Value) -> None:
+        self.states.write(place, [own.value for own in self._state()])
+
+    def _take_up(self, place: Value) -> None:
+        for own, value in zip(self._state(), self.states.read(place), strict=True):
+            own.value = value
+
+    def _approach(self, number: Value, place: Value, resting: Value) -> None:
+        """Down to the first cell in which a line may meet something, or below the level where it rests.
+
+        What it reads next is asked for: the data of the cell, or all bounds within its block.
+        """
+        self._take_up(place)
+        with self.builder.if_then(self.arrived.value):
+            line = self._entered(number, place)
+            self.going.value, self.arrived.value, self.resting.value = I1(1), I1(0), resting
+            with self.lanes.repeat_while(lambda: self.going.value):
+                self._step(line, self._arrive, self._rest)
+            self._keep(place)
 
     def _arrive(self, cell: Sequence[Value], s: Value, out: Value) -> None:
         self.going.value, self.arrived.value = I1(0), I1(1)
         self.windows.ask(*cell)
 
-    def _found(self) -> list[Variable]:
-        """What `_approach` finds."""
-        return [*self.cell_at, self.s, self.arrived]
-
-    def _kept(self, place: Value) -> list[Value]:
-        """Where that is kept."""
-        e, b = self.lanes, self.builder
-        cells = (e.advance(self.first_cells, b.add(b.shl(place, I64(1)), I64(axis)), I64) for axis in range(2))
-        return [*cells, e.advance(self.first_s, place, DOUBLE), e.advance(self.arrivals, place, I1)]
+    def _rest(self, cell: Sequence[Value], level: Value) -> None:
+        """Where a line goes down from a level."""
+        with self.builder.if_else(self.builder.icmp_signed("==", level, self.resting.value)) as (rest, on):
+            with rest:
+                self.going.value, self.arrived.value = I1(0), I1(1)
+                self._ask_for_all_bounds(cell)
+            with on:
+                self._ask_for_bounds(cell, level)
 
     def _walk(self, number: Value, lane: Value, place: Value) -> None:
         """From the first cell on."""
-        e, b = self.lanes, self.builder
-        for address, variable, kind in zip(self._kept(place), self._found(), (I64, I64, DOUBLE, I1), strict=True):
-            variable.value = b.load(address, typ=kind)
-        with b.if_then(self.arrived.value):
-            line = self._line(number)
-            self.level.value, self.going.value = I64(0), I1(1)
-            self.ended_at.value, self.ended_with.value = DOUBLE(-1.0), DOUBLE(0.0)
-            with e.repeat_while(lambda: self.going.value):
-                self._step(line, partial(self._in_cell, line, lane))
+        self._take_up(place)
+        with self.builder.if_then(self.arrived.value):
+            line = self._entered(number, place)
+            self.going.value, self.ended_at.value, self.ended_with.value = I1(1), DOUBLE(-1.0), DOUBLE(0.0)
+            with self.lanes.repeat_while(lambda: self.going.value):
+                self._step(line, partial(self._in_cell, line, lane), self._ask_for_bounds)
 
     def _cell_of(self, place: Value, low: Value, high: Value) -> Value:
         """⌊place⌋ within [low, high]."""
@@ -272,7 +329,12 @@ class _Program:
     def _larger(self, a: Value, c: Value) -> Value:
         return self.builder.select(self.builder.icmp_signed(">", a, c), a, c)
 
-    def _step(self, line: _Line, in_cell: Callable[[Sequence[Value], Value, Value], None]) -> None:
+    def _step(
+        self,
+        line: _Line,
+        in_cell: Callable[[Sequence[Value], Value, Value], None],
+        going_down: Callable[[Sequence[Value], Value], None],
+    ) -> None:
         e, b = self.lanes, self.builder
         level, s = self.level.value, self.s.value
         cell = [own.value for own in self.cell_at]
@@ -284,7 +346,7 @@ class _Program:
         with b.if_then(self.relevant.value), b.if_else(b.icmp_signed(">", level, I64(0))) as (down, here):
             with down:
                 self.level.value, self.on.value = self._lower(level), I1(0)
-                self._ask_for_bounds(cell, self._larger(b.sub(level, I64(_LEVELS_AHEAD)), I64(self.cell.finest)))
+                going_down(cell, level)
             with here:
                 in_cell(cell, s, out)
         with b.if_then(b.and_(self.on.value, self.going.value)):
@@ -316,7 +378,17 @@ class _Program:
         return e.advance(j.bounds, b.shl(b.add(start, b.add(b.mul(y, width), x)), I64(1)), FLOAT)
 
     def _ask_for_bounds(self, cell: Sequence[Value], level: Value) -> None:
-        self.lanes.ask(self._bounds(cell, level))
+        """Some levels below this one."""
+        below = self._larger(self.builder.sub(level, I64(_LEVELS_AHEAD)), I64(self.cell.finest))
+        self.lanes.ask(self._bounds(cell, below))
+
+    def _ask_for_all_bounds(self, cell: Sequence[Value]) -> None:
+        """Within a block where lines rest: rows of the blocks below."""
+        b, (x, y) = self.builder, cell
+        for level in range(self.cell.finest, self.cell.finest + _RESTING):
+            top = b.and_(y, I64(-1 << self.cell.finest + _RESTING))
+            for row in range(0, 1 << self.cell.finest + _RESTING, 1 << level):
+                self.lanes.ask(self._bounds([x, b.add(top, I64(row))], I64(level)))
 
     def _advance(self, line: _Line, cell: Sequence[Value], level: Value, ways: Sequence[Value], out: Value) -> None:
         """To the beginning of the next block."""
