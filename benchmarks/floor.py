@@ -23,7 +23,6 @@ from torch import Tensor
 from filterlab.kernels import Kernel
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu.compiler import compiled
-from filterlab.ops.cpu.frame import new_module
 from filterlab.ops.cpu.lanes import I32, I64, POINTER, Lanes, Value
 
 ACCUMULATORS = 12
@@ -54,9 +53,8 @@ class Program:
     lanes: int
     text: str = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
 
-    def generate(self) -> str:
-        """Its LLVM IR; everything it depends on is in the attributes."""
-        module, function = new_module()
+    def write(self, function: ir.Function) -> None:
+        """It, into an empty function; everything it depends on is in the attributes."""
         e = Lanes(ir.IRBuilder(function.append_basic_block("entry")), "float32", self.lanes)
         buffer, steps, times = (
             e.builder.load(e.advance(function.args[0], I64(i), I64), typ=kind)
@@ -64,7 +62,6 @@ class Program:
         )
         {"multiply-add": self._multiply_add, "read": self._read, "copy": self._copy}[self.kind](e, buffer, steps, times)
         e.builder.ret_void()
-        return str(module)
 
     def _multiply_add(self, e: Lanes, buffer: Value, steps: Value, times: Value) -> None:
         a, b = (e.load(e.advance(buffer, I64(i * e.count), e.number), e.number, e.count) for i in range(2))

@@ -40,8 +40,8 @@ class Signal(Field):
 
     Args:
         name: what error messages and reports call it.
-        value_and_gradient: points `(..., 3)` -> (value `(...)`, exact gradient `(..., 3)`), differentiable torch code; of
-            whatever type, jets are of that of the points.
+        value_and_gradient: points `(..., 3)` -> (value `(...)`, exact gradient `(..., 3)`), differentiable torch code,
+            of any type: jets are of that of the points.
         lower, upper: corners of the box it is looked at in, x, y, z.
         voxel_size: nominal voxel edge, the unit of a renderer's step; default 1/64 of the longest edge of the box.
         degree: in x, y and z together, if it is a polynomial.

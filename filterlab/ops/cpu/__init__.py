@@ -1,6 +1,6 @@
 """Every op as vector code for this processor, compiled at its first use.
 
-    stencil ──▶ variant ──generate──▶ LLVM IR ──compiler──▶ machine code ──▶ cache (disk)
+    stencil ──▶ variant ──write──▶ LLVM IR ──compiler──▶ machine code ──▶ cache (disk)
                                                                 │
     tensors ──▶ job ────────────────────────────threads─────────┴──▶ result
 

@@ -42,11 +42,9 @@ class BlockBitsJob(job.Job):
 class BlockBitsVariant:
     """Everything the program depends on, apart from the machine: nothing."""
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _Program(function).write()
-        return str(module)
 
 
 class _Program:

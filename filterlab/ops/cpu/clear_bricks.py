@@ -53,11 +53,9 @@ class ClearBricksVariant:
 
     radii: int
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _Program(self.radii, function).write()
-        return str(module)
 
 
 class _Program:

@@ -21,11 +21,11 @@ from importlib.resources.abc import Traversable
 from typing import Protocol, TypeVar
 
 from llvmlite import binding as llvm
+from llvmlite import ir
 
 from filterlab import forking
 from filterlab.ops.cpu import cache as disk
-from filterlab.ops.cpu import threads
-from filterlab.ops.cpu.frame import ENTRY
+from filterlab.ops.cpu import frame, threads
 from filterlab.ops.cpu.job import Function
 
 SOURCES = (
@@ -47,8 +47,8 @@ _Result = TypeVar("_Result")
 class Variant(Hashable, Protocol):
     """A frozen dataclass with everything that a program depends on, apart from the machine."""
 
-    def generate(self) -> str:
-        """The program as LLVM IR text, with the entry point `frame.ENTRY`."""
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         ...
 
 
@@ -147,7 +147,7 @@ Sums are rounded alike, but for those of SLIM surfaces and of jets of heights, w
 def _compile(variant: Variant) -> bytes:
     """An object file. Our programs have vectors and loops as they should be: LLVM shall not rearrange them."""
     machine = _machine()
-    module = llvm.parse_assembly(variant.generate())
+    module = llvm.parse_assembly(frame.text(variant.write))
     module.triple = machine.triple
     module.verify()
     passes = llvm.create_new_module_pass_manager()
@@ -161,7 +161,7 @@ def _load(code: bytes) -> Function:
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    function = _signature(engine.get_function_address(ENTRY))
+    function = _signature(engine.get_function_address(frame.ENTRY))
     function.owner = engine  # type: ignore[attr-defined]  # of the machine code: it lives as long as who calls it
     return function
 

@@ -126,11 +126,9 @@ class MarchVariant:
     room: bool
     lanes: int
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         (_Adjoint if self.gradients else _March)(self, function).write()
-        return str(module)
 
 
 class Parts:

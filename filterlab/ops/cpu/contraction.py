@@ -77,11 +77,9 @@ class ContractionVariant:
     lanes: int
     packs: int
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _Program(self, function).write()
-        return str(module)
 
 
 Read = Callable[[Value], list[Value]]

@@ -105,11 +105,9 @@ class RaycastVariant:
     room: bool
     lanes: int
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _PROGRAMS[self.asked](self, function).write()
-        return str(module)
 
 
 @dataclass(frozen=True)

@@ -64,11 +64,9 @@ class FoldingVariant:
     arithmetic: str
     lanes: int
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _Program(self, function).write()
-        return str(module)
 
 
 class _Program:

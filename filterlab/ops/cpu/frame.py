@@ -6,7 +6,7 @@ chunks the function returns.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import SimpleNamespace
 
@@ -20,12 +20,13 @@ SHARED = ("next", "met")
 _SIGNATURE = ir.FunctionType(ir.VoidType(), [POINTER, I64, I64])
 
 
-def new_module() -> tuple[ir.Module, ir.Function]:
-    """A module with the empty function `run`."""
+def text(write: Callable[[ir.Function], None]) -> str:
+    """A module with the function `run`, whose body is written, as LLVM IR text."""
     module = ir.Module("filterlab")
     function = ir.Function(module, _SIGNATURE, ENTRY)
     function.attributes.add("nounwind")
-    return module, function
+    write(function)
+    return str(module)
 
 
 def call(builder: ir.IRBuilder, program: Value, job: Value) -> None:

@@ -45,12 +45,10 @@ class HeightHullsVariant:
     cell: Cell
     storage: str
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         assert self.cell.finest in (0, LANES.bit_length() - 1), self.cell.finest
-        module, function = frame.new_module()
         _Program(self, function).write()
-        return str(module)
 
 
 class _Program:

@@ -95,11 +95,9 @@ class HeightRaysVariant:
     storage: str
     rays: str
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _PROGRAMS[self.asked](self, function).write()
-        return str(module)
 
 
 @dataclass(frozen=True)

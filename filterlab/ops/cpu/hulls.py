@@ -62,14 +62,12 @@ class HullsVariant:
     storage: str
     lanes: int
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         if not isinstance(self.stencil, TetrahedralStencil):
             _OfCells(self, function).write()
         else:
             (_OfOctahedra if self.stencil.spline.octahedral else _OfCubes)(self, function).write()
-        return str(module)
 
 
 class _Program:

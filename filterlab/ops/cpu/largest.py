@@ -50,11 +50,9 @@ class LargestVariant:
     room: bool
     lanes: int
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _Largest(self, function).write()
-        return str(module)
 
 
 class _Largest:

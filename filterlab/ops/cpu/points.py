@@ -84,11 +84,9 @@ class PointsVariant:
     lanes: int
     raised: tuple[tuple[int, ...], ...] = ()
 
-    def generate(self) -> str:
-        """The program as LLVM IR text: one function that takes chunks of packs until none is left."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _Program(self, function).write()
-        return str(module)
 
 
 class _Program:

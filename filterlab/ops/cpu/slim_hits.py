@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from llvmlite import ir
 
-from filterlab.ops.cpu import frame, job, mathematics, tree_walk
+from filterlab.ops.cpu import job, mathematics, tree_walk
 from filterlab.ops.cpu.lanes import DOUBLE, FLOAT, I1, I8, I32, I64, Value
 from filterlab.ops.cpu.quadric_leaves import Met, QuadricLeaves, Take
 from filterlab.ops.cpu.tree_walk import Ray, greatest
@@ -59,11 +59,9 @@ class SheetsVariant:
     reversed: bool
     fused: bool
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _Sheets(self, function, SHEETS).write()
-        return str(module)
 
 
 @dataclass(frozen=True)
@@ -75,11 +73,9 @@ class MembersVariant:
     fused: bool
     reversed: bool = False
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _Members(self, function, MEMBERS).write()
-        return str(module)
 
 
 class _Walk(QuadricLeaves):

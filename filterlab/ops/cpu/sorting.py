@@ -61,9 +61,8 @@ class SortingVariant:
     lanes: int
     axes: int
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         builder = ir.IRBuilder(function.append_basic_block("entry"))
         e = Lanes(builder, self.arithmetic, self.lanes)
         told = frame.load_job(e, function.args[0], FIELDS)
@@ -78,7 +77,6 @@ class SortingVariant:
                 case "arrange":
                     _arrange(e, told)
         builder.ret_void()
-        return str(module)
 
 
 def _count(e: Lanes, job: SimpleNamespace, axes: int) -> None:

@@ -344,8 +344,6 @@ class RowsVariant(ABC):
     def program(self, function: ir.Function) -> Rows:
         """What is to be written."""
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         self.program(function).write()
-        return str(module)

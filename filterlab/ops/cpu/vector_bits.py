@@ -41,11 +41,9 @@ class VectorVariant:
     arithmetic: str
     lanes: int
 
-    def generate(self) -> str:
-        """The program as LLVM IR text."""
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
+        """The program, into an empty function."""
         _write(function, self)
-        return str(module)
 
 
 def _write(function: ir.Function, variant: VectorVariant) -> None:

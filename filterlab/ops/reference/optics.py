@@ -51,7 +51,9 @@ class Table:
         x = self.positions
         if len(x) == 1:
             return OnTable(torch.zeros_like(value, dtype=torch.int32), torch.zeros_like(value) * value)
-        interval = torch.searchsorted(x[1:-1].detach().contiguous(), value.detach().contiguous(), right=True, out_int32=True)
+        interval = torch.searchsorted(
+            x[1:-1].detach().contiguous(), value.detach().contiguous(), right=True, out_int32=True
+        )
         fraction = (value - _take(x[:-1], interval)) / _take(x.diff(), interval)
         return OnTable(interval, fraction.clamp(0, 1))
 
