@@ -13,7 +13,7 @@ from llvmlite import ir
 
 from filterlab.kernels import LINEAR, TensorKernel, bspline
 from filterlab.ops import Stencil, march
-from filterlab.ops.cpu import compiler, frame, mathematics
+from filterlab.ops.cpu import compiler, mathematics
 from filterlab.ops.cpu.lanes import I64, POINTER, Lanes
 from filterlab.ops.differentiable.march import adjoint, missing, run
 from filterlab.ops.reference import march as reference
@@ -28,8 +28,7 @@ class OnPacks:
     name: str
     arithmetic: str
 
-    def generate(self) -> str:
-        module, function = frame.new_module()
+    def write(self, function: ir.Function) -> None:
         b = ir.IRBuilder(function.append_basic_block("entry"))
         e = Lanes(b, self.arithmetic, LANES[self.arithmetic])
         source, target = (b.load(e.advance(function.args[0], I64(i), I64), typ=POINTER) for i in range(2))
@@ -42,7 +41,6 @@ class OnPacks:
                 y = getattr(mathematics, self.name)(e, x)
             e.store(y, e.advance(target, i, e.number))
         b.ret_void()
-        return str(module)
 
 
 def on_packs(name: str, x: np.ndarray) -> np.ndarray:

@@ -33,9 +33,8 @@ class RootsVariant:
     arithmetic: str
     lanes: int = 4
 
-    def generate(self) -> str:
+    def write(self, function: ir.Function) -> None:
         """Roots in the order in which they are found; what is beyond the last one stays as it is."""
-        module, function = frame.new_module()
         b = ir.IRBuilder(function.append_basic_block("entry"))
         e, n = Lanes(b, self.arithmetic, self.lanes), self.degree
         number = ARITHMETIC[self.arithmetic]
@@ -60,7 +59,6 @@ class RootsVariant:
                 e.store(e.where(found, t, e.where(at_end, e.constant(1), e.constant(float("inf")))), place)
                 left.value, rank.value = b.and_(left.value, b.not_(over)), b.add(rank.value, I64(1))
         b.ret_void()
-        return str(module)
 
 
 def roots_of(coefficients: np.ndarray) -> list[list[float]]:
