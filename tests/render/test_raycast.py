@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 
 import pytest
@@ -21,6 +22,7 @@ from filterlab.render.materials import (
     Toon,
     Triplanar,
 )
+from filterlab.render.raycast import Options
 from filterlab.surfaces import LevelSet
 from filterlab.volume import Volume
 
@@ -285,3 +287,8 @@ def test_curvature_of_the_ball_colours_its_image() -> None:
 def test_materials_that_cannot_be_are_refused(make, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_type_checkers_know_every_keyword():
+    own = {"surface", "camera", "material", "channels"}
+    assert own | set(Options.__annotations__) == set(inspect.signature(raycast).parameters)

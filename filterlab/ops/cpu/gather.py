@@ -206,13 +206,12 @@ class Program:
         return cls(compiler.compiled(variant), job, lanes, most)
 
     def after(self, place: Placing) -> Program:
-        """gather at points that this places first."""
-        job, geometry = self.job.copy(), place.placement.geometry
+        """gather at points that this places first; gradients come back by its matrix."""
+        job = self.job.copy()
         job.call(place=place.run, placing=place.job)
-        job.oblique = geometry.diagonal is None
-        for row, numbers in zip(AXES, geometry.inverse, strict=True):
-            for column, number in zip(AXES, numbers, strict=True):
-                setattr(job, f"matrix_{row}{column}", number)
+        job.oblique = place.placement.geometry.diagonal is None
+        for name in (f"matrix_{row}{column}" for row in AXES for column in AXES):
+            setattr(job, name, getattr(place.job, name))
         return replace(self, job=job)
 
     def shared(self, coefficients: Tensor, points: Tensor, rows: Tensor, **gradient: Tensor) -> list[PointsJob]:
