@@ -232,6 +232,36 @@ def test_a_ray_in_a_flat_patch_does_not_hit_it():
     assert not surface.hit(torch.tensor([-1, 0.5, 0]).double(), torch.tensor([1, 0, 0.0]).double()).valid
 
 
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("tilt", [0, 1e-15, 1e-9, 1e-7, 1e-4])
+def test_a_ray_above_a_flat_patch_and_parallel_to_it_does_not_hit_it(tilt, implementation):
+    """All of α, β, γ but one are 0 to within rounding; as of the sides of a box that is seen from the front."""
+    turn = torch.linalg.qr(numbers(3, 3, seed=3))[0]
+    turned = lambda x: (x[..., None, :] * turn).sum(-1)  # noqa: E731
+    above = torch.cat((within(200, 2, seed=21), 0.01 + 0.4 * within(200, 1, seed=22)), 1)
+    way = torch.cat((numbers(200, 2, seed=23), tilt * numbers(200, 1, seed=24)), 1)
+    way = way / way.norm(dim=1, keepdim=True)
+    cast = BilinearQuads(turned(SQUARE), torch.tensor([[0, 1, 2, 3]])).described
+    o, d = turned(above) - 5 * turned(way), turned(way)
+    assert not bool((ops.hits(cast, o, d, 1, implementation=implementation)[1] >= 0).any())
+
+
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("row", [[0, 1, 2, 2], [0, 0, 1, 2], [0, 1, 1, 2], [0, 1, 2, 0]])
+def test_triangles_end_where_they_do(row, implementation):
+    """Next to each corner: 1e-10 within is hit, 1e-10 beside it is not."""
+    vertices = numbers(3, 3, seed=25)
+    middle = vertices.mean(0)
+    corner = vertices.repeat(40, 1)
+    into = torch.nn.functional.normalize(middle - corner, dim=1)
+    way = torch.nn.functional.normalize(numbers(120, 3, seed=26), dim=1)
+    cast = BilinearQuads(vertices, torch.tensor([row])).described
+    for shift, hit in ((1e-10, True), (-1e-10, False)):
+        o = corner + shift * into - 2 * way
+        found = ops.hits(cast, o, way, 1, implementation=implementation)[1][:, 0] >= 0
+        assert bool((found == hit).all())
+
+
 def test_the_program_does_what_plain_torch_does():
     vertices, faces = ball(8, 0.3)
     o, d = 3 + 2 * numbers(3000, 3, seed=17), numbers(3000, 3, seed=18)
