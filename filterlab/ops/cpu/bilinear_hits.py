@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from llvmlite import ir
 
-from filterlab.ops.bilinear import ACROSS, CENTER, CORNER, LENGTH, PLACE, SQUARE, TWIST, UP
+from filterlab.ops.bilinear import ACROSS, CENTER, CORNER, LENGTH, MEETING, PLACE, SQUARE, TWIST, UP
 from filterlab.ops.cpu.lanes import DOUBLE, I64, Value
 from filterlab.ops.cpu.tree_walk import Ray, Rows, RowsVariant
 from filterlab.ops.tree import WIDTH
@@ -53,18 +53,21 @@ class _Program(Rows):
         return self.rows(base, range(rows.start, rows.stop))
 
     def _less_parallel(self, base: Value, ray: Ray, q: list[Value]) -> tuple[_Patch, Value]:
-        """Patches with a and d in the order in which D is less parallel to d + h / 2; and where they changed places."""
+        """Patches with a and d in that order in which D is less parallel to d and d + h; where they changed places."""
         e, b = self.lanes, self.builder
         across, up, twist = (self._vector(base, rows) for rows in (ACROSS, UP, TWIST))
-        half = e.constant(0.5)
-        lines = ([e.multiply_add(half, t, x) for t, x in zip(twist, line, strict=True)] for line in (across, up))
-        apart = [self._square(self._cross(ray.along, line)) for line in lines]
+        edges = (self._edges(line, twist) for line in (across, up))
+        apart = [e.minimum(*(self._square(self._cross(ray.along, x)) for x in pair)) for pair in edges]
         turned = b.fcmp_ordered(">", apart[0], apart[1])
         first, second = ([e.where(turned, x, y) for x, y in zip(*p, strict=True)] for p in ((up, across), (across, up)))
         corner = self._vector(base, CORNER)
         from_corner = [e.subtract(x, c) for x, c in zip(q, corner, strict=True)]
         length, place = self.rows(base, [LENGTH, PLACE])
         return _Patch(from_corner, first, second, twist, ray.along, length, place), turned
+
+    def _edges(self, line: list[Value], twist: list[Value]) -> tuple[list[Value], list[Value]]:
+        """The two that lines of a family begin and end with."""
+        return line, [self.lanes.add(x, t) for x, t in zip(line, twist, strict=True)]
 
     def _roots(self, patch: _Patch) -> tuple[Value, Value, Value, Value, Value]:
         """u of front and back; masks of those that are one, and by what they are off; a mask of rays that meet any."""
@@ -81,22 +84,39 @@ class _Program(Rows):
         front = e.where(touches, e.divide(e.negate(beta), alpha), front)
         by_root = e.divide(rounding, e.multiply(e.constant(2), s))
         off = e.where(touches, e.divide(e.square_root(slack), a), by_root)
-        return front, back, touches, off, b.fcmp_ordered(">", e.maximum(e.maximum(a, h), g), rounding)
+        met = b.fcmp_ordered(">", e.maximum(e.maximum(a, h), g), rounding)
+        u = e.clamp(front, e.constant(0), e.constant(1))
+        rest = e.multiply_add(e.multiply_add(alpha, u, e.multiply(e.constant(2), beta)), u, gamma)
+        beside = b.fcmp_ordered(">", e.absolute(rest), e.multiply(e.constant(MEETING), rounding))
+        return front, back, touches, off, b.and_(met, b.not_(b.and_(touches, beside)))
 
     def _along(self, patch: _Patch, u: Value, off: Value) -> tuple[Value, Value]:
         """ρ where rays meet the lines at u, and a mask: where u and v are in [0, 1]."""
         e, b = self.lanes, self.builder
         within = self._in_unit(u, off)
         u = e.clamp(u, e.constant(0), e.constant(1))
-        line = [e.multiply_add(u, t, x) for t, x in zip(patch.twist, patch.up, strict=True)]
+        line = self._line(patch.up, u, patch.twist)
         way = [e.subtract(e.multiply(u, x), c) for x, c in zip(patch.across, patch.from_corner, strict=True)]
         n = self._cross(patch.along, line)
         square = self._square(n)
         v = e.divide(self.dot(self._cross(way, patch.along), n), square)
-        off = e.multiply_add(e.multiply(e.constant(3), patch.length), off, patch.place)
-        off = e.divide(off, e.square_root(square))
-        rho = e.divide(self.dot(self._cross(way, line), n), square)
-        return rho, b.and_(within, self._in_unit(v, off))
+        inner = e.clamp(v, e.constant(0), e.constant(1))
+        point, edge = self._line(way, inner, line), self._line(patch.across, inner, patch.twist)
+        by = e.multiply(e.absolute(e.subtract(v, inner)), e.square_root(square))
+        on_line = b.or_(b.fcmp_ordered("==", v, inner), self._at_edge(patch, point, edge, off, by))
+        return self.dot(point, patch.along), b.and_(within, on_line)
+
+    def _at_edge(self, patch: _Patch, point: list[Value], edge: list[Value], off: Value, by: Value) -> Value:
+        """Where rays that pass by S(u, v), at the edge of a patch, meet the edge, u and places being so far off."""
+        e, b = self.lanes, self.builder
+        length = e.square_root(self._square(edge))
+        reach = e.multiply_add(e.multiply(e.constant(3), e.minimum(off, e.constant(1))), length, patch.place)
+        apart = e.absolute(self.dot(point, self._cross(patch.along, edge)))
+        rounding = e.multiply(e.constant(MEETING), e.multiply(patch.length, patch.place))
+        return b.and_(b.fcmp_ordered("<=", by, reach), b.fcmp_ordered("<=", apart, rounding))
+
+    def _line(self, start: list[Value], at: Value, way: list[Value]) -> list[Value]:
+        return [self.lanes.multiply_add(at, w, s) for s, w in zip(start, way, strict=True)]
 
     def _in_unit(self, x: Value, off: Value) -> Value:
         e, b = self.lanes, self.builder
