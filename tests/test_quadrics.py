@@ -11,7 +11,7 @@ from torch import Tensor
 from filterlab.ops.differentiable import quadrics
 from filterlab.ops.reference import quadrics as reference
 from filterlab.render import PerspectiveCamera, raycast
-from filterlab.surfaces import Bounds, Planes, Quadrics, Spheres, Tetrahedra, mesh
+from filterlab.surfaces import Bounds, Planes, Quadrics, Spheres, Tetrahedra, culling, mesh
 from tests import quadric_rays
 
 F64 = torch.float64
@@ -337,6 +337,54 @@ def test_culling_loses_nothing_and_most_of_what_faces_away(kind, faces):
     assert int(away.sum()) > 100
     assert (~kept[away]).double().mean() > 0.8
     assert bool(kept[shown].all())
+
+
+def beyond_planes(rng: torch.Generator) -> tuple[culling.Local, culling.Polar]:
+    """Quadrics in tetrahedra, each with a plane anywhere."""
+    A, b, c, p, value = (torch.randn(300, *shape, dtype=F64, generator=rng) for shape in ((3, 3), (3,), (), (3,), ()))
+    corners = torch.randn(300, 4, 3, dtype=F64, generator=rng)
+    return culling.Local(A + A.mT, b, 2 * c, corners.norm(dim=-1).amax(1), corners), culling.Polar(p, value)
+
+
+def values(local: culling.Local, polar: culling.Polar, y: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the largest F at points (M, K, 3) beyond the planes, ∞ and −∞ where there are none."""
+    value = (y * (y @ local.A + 2 * local.b[:, None])).sum(-1) + local.c[:, None]
+    there = (y @ polar.p[:, :, None])[..., 0] + polar.value[:, None] > 0
+    return torch.where(there, value, torch.inf).amin(1), torch.where(there, value, -torch.inf).amax(1)
+
+
+def test_bounds_in_caps_hold_every_value_there():
+    rng = torch.Generator().manual_seed(3)
+    local, polar = beyond_planes(rng)
+    lowest, highest = culling.in_cap(local, polar)
+    y = torch.randn(300, 2000, 3, dtype=F64, generator=rng)
+    y *= (local.radii[:, None] * torch.rand(300, 2000, dtype=F64, generator=rng) ** 0.1 / y.norm(dim=-1))[..., None]
+    low, high = values(local, polar, y)
+    assert bool(((lowest <= low) & (high <= highest)).all())
+    wide = low < high
+    assert int(wide.sum()) > 200
+    assert float(((highest - lowest) / (high - low))[wide].median()) < 2.5
+
+
+def test_signs_in_hulls_are_those_of_every_value_there():
+    rng = torch.Generator().manual_seed(4)
+    local, polar = beyond_planes(rng)
+    lowest, highest = culling.in_hull(local, polar)
+    part = torch.rand(300, 2000, 4, dtype=F64, generator=rng).log()
+    assert local.corners is not None
+    low, high = values(local, polar, part / part.sum(-1, keepdim=True) @ local.corners)
+    assert bool((low > 0)[lowest > 0].all())
+    assert bool((high < 0)[highest < 0].all())
+    one_sign = ((low > 0) | (high < 0)) & (low < high)
+    assert int(one_sign.sum()) > 60
+    assert float(((lowest > 0) | (highest < 0))[one_sign].double().mean()) > 0.5
+
+
+def test_bounds_of_a_saddle_in_half_a_ball():
+    A, c, r = torch.diag(numbers([1, -2, 0])[0])[None], numbers(3.0), numbers(2.0)
+    local = culling.Local(A, numbers([0, 0, 0.5]), c, r, None)
+    ends = culling.in_cap(local, culling.Polar(numbers([0, 0, 1]), numbers([0.0])[0]))
+    assert torch.cat(ends).tolist() == pytest.approx([3 - 8, 3 + 4 + 2])
 
 
 def test_nothing_is_culled_where_both_faces_count():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -61,7 +61,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Question:
-    """What `recommend` is asked, as its arguments; `boundary` by name."""
+    """What `recommend` is asked, as its arguments; `boundary` by name; level None: of no surface in particular."""
 
     task: str
     max_error: float
@@ -69,6 +69,7 @@ class Question:
     max_time: float
     boundary: str
     nan: str
+    level: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         for name in ("max_error", "max_memory", "max_time"):
@@ -76,6 +77,8 @@ class Question:
                 raise ValueError(f"{name} must be positive; got {getattr(self, name)!r}")
         if self.task not in TASKS:
             raise ValueError(f"task must be one of {', '.join(TASKS)}; got {self.task!r}")
+        if self.level is not None and self.task != "isosurface":
+            raise ValueError(f"level is that of an isosurface; got level={self.level:g} for task {self.task!r}")
 
     def fits(self, candidate: Candidate) -> bool:
         """Whether it most likely stays within the budget, and within the limits."""
@@ -127,6 +130,7 @@ def recommend(
     max_error: float,
     *,
     task: str = "resample",
+    level: float | None = None,
     max_memory: float = math.inf,
     max_time: float = math.inf,
     boundary: str | Boundary = Boundary.MIRROR,
@@ -182,11 +186,11 @@ def recommend(
             float32 overflows.
     """
     volume, boundary = as_volume(volume), Boundary.named(boundary)
-    question, names = Question(task, max_error, max_memory, max_time, str(boundary), nan), _known(methods)
+    question, names = Question(task, max_error, max_memory, max_time, str(boundary), nan, level=level), _known(methods)
     samples, unknown = resolved(volume.samples.detach(), nan)
     samples = samples.reshape(-1, *samples.shape[-3:])
     unknown = None if unknown is None else unknown.reshape(samples.shape).cpu()
-    yardstick = Yardstick.of(samples.cpu(), unknown, boundary, seed, lambda done: progress(0.3 * done, "errors"))
+    yardstick = Yardstick.of(samples.cpu(), unknown, boundary, seed, lambda done: progress(0.3 * done, "errors"), level)
     errors = errors_of(yardstick, names, samples.dtype, lambda e: yardstick.estimate(task, e).likely <= max_error)
     progress(0.5, "costs")
     order, tick = 0 if task == "resample" else 1, lambda done: progress(0.5 + 0.5 * done, "costs")

@@ -25,12 +25,12 @@ from torch import Tensor
 
 from filterlab.fields.base import Field
 from filterlab.ops import quadrics as description
+from filterlab.surfaces import culling
 from filterlab.surfaces import quadric_kinds as kinds
 from filterlab.surfaces.bounds import Bounds, check_rows
 from filterlab.surfaces.in_tree import InTree, domain_around
 
 _ROUNDINGS = 16  # of the largest coordinate, by which bounds are larger: neighbours that share a face leave no gap
-_SEEN = 1e-12  # of the terms of a test, by which it has to fail
 
 
 class Quadrics(InTree[description.Quadrics]):
@@ -220,13 +220,18 @@ class Quadrics(InTree[description.Quadrics]):
     # --- what is cast ---
 
     def _described(self) -> description.Quadrics:
-        bounds, (lower, upper) = self.bounds, self.bounds.boxes.around()
-        slack = _ROUNDINGS * torch.finfo(torch.float64).eps * torch.maximum(lower.abs(), upper.abs()).amax()
+        bounds, slack = self.bounds, self._slack
         planes = bounds.planes.clone()
         planes[..., 3] += (planes[..., :3] * bounds.centers[:, None]).sum(-1) - slack
         return description.Quadrics.of(
             bounds.boxes, self._about_centers(), bounds.centers, bounds.radii + slack, planes, self.faces
         )
+
+    @property
+    def _slack(self) -> float:
+        """By how much bounds are larger."""
+        lower, upper = self.bounds.boxes.around()
+        return _ROUNDINGS * torch.finfo(torch.float64).eps * float(torch.maximum(lower.abs(), upper.abs()).amax())
 
     def _about_centers(self) -> tuple[Tensor, Tensor, Tensor]:
         """A, b, c in float64, about the centres of the bounds."""
@@ -238,9 +243,10 @@ class Quadrics(InTree[description.Quadrics]):
     def seen_from(self, eye: Tensor) -> Quadrics:
         """For rays from a world point (3,): the same hits, without the quadrics that show it no face that counts.
 
-        A point y of a surface, from the eye, faces away from it if c' < −b'·y, with c' = F(eye), b' = b + A eye. Where
-        that holds in all of a ball or a tetrahedron the quadric is left out; the tests are exact for them. Numbers
-        stay. With faces "both" nothing is left out. It takes as long as some frames gain: for many rays from one place.
+        What faces a point is on one side of its polar plane. Where a ball or a tetrahedron lies on the other side, or F
+        has one sign in what is left of it, the quadric is left out; cuts are not looked at (`surfaces.culling`).
+        Numbers stay. With faces "both" nothing is left out. It takes as long as some frames gain: for many rays from
+        one place.
 
         Source: Stoll, Gumhold & Seidel, Incremental raycasting of piecewise quadratic surfaces on the GPU, 2006,
         equations 16 to 19.
@@ -251,15 +257,7 @@ class Quadrics(InTree[description.Quadrics]):
 
     def facing(self, eye: Tensor) -> Tensor:
         """(M,) whether some point within the bounds may show the side that counts to a world point (3,)."""
-        eye = eye.detach().to(self.bounds.centers)
-        sign = 1 if self.faces == "front" else -1
-        A, b, c = (sign * x for x in self._about_centers())
-        e = eye - self.bounds.centers
-        polar = b + (A * e[:, None]).sum(-1)
-        own = (b * e).sum(-1)
-        reach = self.bounds.radii * polar.norm(dim=-1)
-        if self.bounds.corners is not None:
-            corners = self.bounds.corners - self.bounds.centers[:, None]
-            reach = torch.minimum(reach, (corners * polar[:, None]).sum(-1).amax(1))
-        size = c.abs() + own.abs() + reach.abs()
-        return c + own + reach >= -_SEEN * size
+        bounds, sign = self.bounds, 1 if self.faces == "front" else -1
+        corners = None if bounds.corners is None else bounds.corners - bounds.centers[:, None]
+        local = culling.Local(*(sign * x for x in self._about_centers()), bounds.radii, corners)
+        return culling.facing(local, eye.detach().to(bounds.centers) - bounds.centers, self._slack)
