@@ -190,7 +190,7 @@ def test_a_ramp_needs_no_more_than_trilinear(boundary) -> None:
 
 def test_of_a_level_the_errors_are_those_next_to_its_surface() -> None:
     """A ball whose surface is a tanh: most of the volume is even, and all errors are at the surface."""
-    n, radius, width = 40, 11.3, 1.1
+    n, radius, width = 40, 11.3, 2.2
     center = torch.tensor([19.2, 20.4, 18.7], dtype=torch.float64)
 
     def function(p: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 from matplotlib.axes import Axes
 
 from experiments.pictures import LEVELS
-from experiments.recommend_validation import FACTOR, HALVES, fitted
+from experiments.recommend_validation import FACTOR, HALVES, fitted, fitted_on_surfaces
 from experiments.report import plots
 from experiments.report.page import Block, Column, Plot, Section, Table
 from experiments.report.style import LOOKS, MISSING, fixed, look, text
 from experiments.runs import Record
-from filterlab.recommendation.calibration import CALIBRATION, FALLS
+from filterlab.recommendation.calibration import CALIBRATION, FALLS, SURFACE
 
 if TYPE_CHECKING:
     from experiments.recommend_validation import Config
@@ -79,6 +79,7 @@ def draw(config: Config, records: Mapping[str, Record], _folder: Path) -> Sectio
             _groups(reporting, "Reporting half, by task.", None),
             _scatter(reporting),
             _calibration(volumes),
+            _on_surfaces(volumes),
             *_failures(reporting),
         ]
     return Section("Does recommend keep its word?", LEAD, blocks)
@@ -274,6 +275,16 @@ def _calibration(volumes: Sequence[Record]) -> Table:
         "would just have held. By L is chosen."
     )
     return Table(columns, rows, caption)
+
+
+def _on_surfaces(volumes: Sequence[Record]) -> Table:
+    """By what these are multiplied where errors are those on a surface."""
+    columns = [Column("", numeric=False), *(Column(letter) for letter in "cCL")]
+    found, rows = fitted_on_surfaces(volumes), []
+    for quantity, used in SURFACE.items():
+        rows.append([f"of the {quantity}, in use", *(fixed(factor) for factor in used)])
+        rows.append(["fitted to the tuning half", *(fixed(factor) for factor in found[quantity])])
+    return Table(columns, rows, "On the surface of a level that is told, the factors above are multiplied by these.")
 
 
 def _failures(volumes: Sequence[Record]) -> Iterator[Table]:

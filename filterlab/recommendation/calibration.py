@@ -44,7 +44,7 @@ CALIBRATION: Mapping[str, tuple[tuple[float, ...], tuple[float, ...], tuple[floa
 }
 """Of values, gradients and second derivatives along lines: c, C and L at each of `FALLS`."""
 
-SURFACE: Mapping[str, tuple[float, float, float]] = {"value": (1.18, 1.39, 1.0), "gradient": (1.2, 1.0, 1.0)}
+SURFACE: Mapping[str, tuple[float, float, float]] = {"value": (1.33, 1.26, 1.0), "gradient": (1.56, 1.32, 1.0)}
 """By what c, C and L are multiplied where errors are those on a surface: it is a smaller part of a volume, and where it
 is an edge, the estimates of the signal are off to the same side all along it."""
 

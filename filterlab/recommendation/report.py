@@ -52,7 +52,7 @@ def sentences(found: Recommendation) -> list[str]:
 def _help(found: Recommendation) -> str:
     """Which budget would be met, and what to change for a smaller one."""
     ways = [f"a budget of {_percent_above(found.best.error.likely)}, which that one most likely keeps"]
-    if found.task != "resample" and found.of_value.likely <= found.max_error:
+    if found.task != "resample" and found.level is None and found.of_value.likely <= found.max_error:
         ways.append(
             "to count the value alone, as task resample does: the gradient is what is off, the value is likely within "
             f"{_percent_above(found.of_value.likely)}"
