@@ -17,6 +17,9 @@ Levels are drawn by volume or by detail, see `pictures`. A pixel of a medium is 
 cancel: it can be right where what it shows is wrong, and so refutes no refusal. Of a pick the rendered picture is set
 beside that of the signal all the same.
 
+For isosurfaces the same is asked again of the picture's level (`level=`): then errors next to that surface are what is
+estimated, and what the picture shows is all that counts.
+
 Budgets are drawn log-uniform, half of them between 0.01 % and 10 %, as people ask; the other half from a quarter of the
 least true error to four times the largest, where answers are hardest. Costs are measured once, on one volume, and
 carried over: what is judged is the choice.
@@ -27,7 +30,7 @@ Volumes of even number are for tuning: `recommend`'s `CALIBRATION` is fitted to 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -43,7 +46,7 @@ from experiments.pictures import NO_PICTURES, Pictures
 from experiments.runs import Record, Run, Unit
 from experiments.variety import CLASSES, Subject, of_class, of_scan, size_of
 from filterlab.methods import METHODS
-from filterlab.recommendation.calibration import CALIBRATION, FALLS
+from filterlab.recommendation.calibration import CALIBRATION, FALLS, SURFACE, factors
 from filterlab.recommendation.choice import TASKS, Candidate, Question, Recommendation, choose, errors_of
 from filterlab.recommendation.errors import SURE, MethodErrors, Yardstick
 from filterlab.recommendation.ways import Way, WayCost, costs_of, ways_of
@@ -56,7 +59,7 @@ HALVES = ("tuning", "reporting")
 
 _BUDGETS = 1e-4, 0.1
 _AROUND = 4.0  # times the true errors
-_COUNTS, _HELD, _LIKELY = 0.05, 0.97, 0.85  # see `filterlab.recommendation.calibration`
+_COUNTS, _PARTS = 0.05, (0.97, 0.97, 0.85)  # see `filterlab.recommendation.calibration`
 _COSTS_ON = 64  # voxels along an axis
 
 
@@ -198,7 +201,41 @@ def truth_of(subject: Subject, boundary: Boundary, way: Way, span: float, pictur
     return Truth(*(math.sqrt(mean) for mean in means), hit=hit, marched=marched)
 
 
+def truths_of(
+    subject: Subject, boundary: Boundary, ways: Iterable[Way], span: float, pictures: Pictures = NO_PICTURES
+) -> dict[Way, Truth]:
+    """Of the fields of all ways; schemes compute the same field."""
+    known: dict[tuple[str, str | None], Truth] = {}
+    found = {}
+    for way in ways:
+        if (way[0], way[2]) not in known:
+            known[way[0], way[2]] = truth_of(subject, boundary, way, span, pictures)
+        found[way] = known[way[0], way[2]]
+    return found
+
+
 # --- judgement --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What `recommend` measures on a volume, all of it or next to the surface of a level."""
+
+    yardstick: Yardstick
+    errors: Mapping[Way, MethodErrors]
+    level: float | None = None
+
+    @classmethod
+    def of(cls, config: Config, subject: Subject, boundary: Boundary, level: float | None = None) -> Measured:
+        """Of all ways."""
+        yardstick = Yardstick.of(subject.volume[None], None, boundary, config.seed, level=level)
+        return cls(yardstick, errors_of(yardstick, config.methods, subject.volume.dtype, lambda _: True), level)
+
+    def answer(self, task: str, budget: float, volume: fl.Volume, costs: Mapping[Way, WayCost]) -> Recommendation:
+        """Without limits of memory and time."""
+        boundary = str(self.yardstick.boundary)
+        question = Question(task, budget, math.inf, math.inf, boundary, "refuse", level=self.level)
+        return choose(question, volume, self.yardstick, self.errors, costs)
 
 
 def _judged(
@@ -209,21 +246,43 @@ def _judged(
     random: np.random.Generator,
 ) -> dict[str, Any]:
     """Estimates and answers under a boundary."""
-    yardstick = Yardstick.of(subject.volume[None], None, boundary, config.seed)
-    errors = errors_of(yardstick, config.methods, subject.volume.dtype, lambda _: True)
+    measured = Measured.of(config, subject, boundary)
+    yardstick, errors = measured.yardstick, measured.errors
     pictures = Pictures.of(subject, yardstick.span, random)
-    known: dict[tuple[str, str | None], Truth] = {}
-    for way in errors:
-        if (way[0], way[2]) not in known:  # schemes compute the same field
-            known[way[0], way[2]] = truth_of(subject, boundary, way, yardstick.span, pictures)
-    truths = {way: known[way[0], way[2]] for way in errors}
+    truths = truths_of(subject, boundary, errors, yardstick.span, pictures)
+    aimed = _aimed(config, subject, boundary, truths, pictures)
     return {
         "boundary": str(boundary),
         "fall": yardstick.fall,
         "doubts": dict(yardstick.doubts),
         "bend": [yardstick.bend, next(iter(truths.values())).bend],
         "ways": list(_compared(yardstick, errors, truths)),
-        "answers": list(_answers(config, subject, yardstick, errors, truths, costs, pictures, random)),
+        "answers": list(_answers(config, subject, measured, aimed, truths, costs, pictures, random)),
+        **({} if aimed is None else {"aimed": _compared_aimed(aimed, subject, truths)}),
+    }
+
+
+def _aimed(
+    config: Config, subject: Subject, boundary: Boundary, truths: Mapping[Way, Truth], pictures: Pictures
+) -> Measured | None:
+    """Next to the surface of the picture; None: there is none, or few of its rays hit."""
+    if pictures.picture is None or not _all_seen(truths, None):
+        return None
+    return Measured.of(config, subject, boundary, pictures.picture.level)
+
+
+def _compared_aimed(aimed: Measured, subject: Subject, truths: Mapping[Way, Truth]) -> dict[str, Any]:
+    """Of all of the surface, and what its picture shows."""
+    assert aimed.level is not None
+    yardstick, (patch,) = aimed.yardstick, aimed.yardstick.patches
+    surface = subject.on_surface(aimed.level, patch.points, patch.weights)
+    of_surface = truths_of(surface, yardstick.boundary, aimed.errors, yardstick.span)
+    shown = {(way[0], way[2]): truth.hit for way, truth in truths.items()}
+    ways = _compared(yardstick, aimed.errors, of_surface)
+    return {
+        "fall": yardstick.fall,
+        "doubts": dict(yardstick.doubts),
+        "ways": [found | {"pictured": shown[found["method"], found["storage"]]} for found in ways],
     }
 
 
@@ -248,8 +307,8 @@ def _compared(
 def _answers(
     config: Config,
     subject: Subject,
-    yardstick: Yardstick,
-    errors: Mapping[Way, MethodErrors],
+    measured: Measured,
+    aimed: Measured | None,
     truths: Mapping[Way, Truth],
     costs: Mapping[tuple[Way, int], WayCost],
     pictures: Pictures,
@@ -260,18 +319,24 @@ def _answers(
     for task in TASKS if subject.differentiable else TASKS[:1]:
         taken = _carried_over(costs, task, subject.volume.numel())
         for near, budget in _budgets(config, task, truths, random):
-            question = Question(task, budget, math.inf, math.inf, str(yardstick.boundary), "refuse")
-            answer = choose(question, volume, yardstick, errors, taken)
+            answer = measured.answer(task, budget, volume, taken)
             found = {"near": near, **judged(answer, partial(_true, task, truths))}
-            yield found | _by_pictures(answer, subject, truths, pictures)
+            found |= _by_pictures(answer, subject, truths, pictures)
+            if task == "isosurface" and aimed is not None:
+                found["aimed"] = judged(aimed.answer(task, budget, volume, taken), partial(_seen, truths))
+            yield found
+
+
+def _all_seen(truths: Mapping[Way, Truth], step: float | None) -> bool:
+    """Whether there is a picture of every field; but for the method `nearest`, which has few levels."""
+    return all(t.pictured(step) is not None for way, t in truths.items() if way[0] != "nearest")
 
 
 def _by_pictures(
     answer: Recommendation, subject: Subject, truths: Mapping[Way, Truth], pictures: Pictures
 ) -> dict[str, Any]:
     """The answer judged by pictures, and the picture of a pick beside the true one; nothing where there are none."""
-    seen = [t.pictured(answer.best.step) for way, t in truths.items() if way[0] != "nearest"]  # it has few levels
-    if pictures.picture is None or answer.task == "resample" or None in seen:
+    if pictures.picture is None or answer.task == "resample" or not _all_seen(truths, answer.best.step):
         return {}
     found = {"level": pictures.picture.drawn_by, "pictured": judged(answer, partial(_seen, truths))}
     if answer.pick is None or answer.pick.step is None or pictures.cloud is None:
@@ -332,18 +397,40 @@ def fitted(records: Sequence[Record]) -> dict[str, tuple[list[float], ...]]:
     return {quantity: _quantiles(_needed(tuning, quantity)) for quantity in CALIBRATION}
 
 
-def _needed(records: Sequence[Record], quantity: str) -> np.ndarray:
-    """(N, 3): φ, and the c and the C with which each interval would just have held, where the doubt counts at all."""
+def fitted_on_surfaces(records: Sequence[Record]) -> dict[str, list[float]]:
+    """`filterlab.recommendation.calibration.SURFACE`, likewise; infinite where nothing tells."""
+    tuning = [r for r in records if r["half"] == HALVES[0]]
+    found = {}
+    for quantity in SURFACE:
+        fall, *needed = _needed(tuning, quantity, "aimed").T
+        known = np.array([factors(quantity, own) for own in fall]).reshape(-1, 3).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            parts = [np.nan_to_num(needed[i > 0] / own, posinf=math.inf) for i, own in enumerate(known)]
+        found[quantity] = [_quantile(own, part) for own, part in zip(parts, _PARTS, strict=True)]
+    return found
+
+
+def _needed(records: Sequence[Record], quantity: str, part: str | None = None) -> np.ndarray:
+    """(N, 3): φ, and the c and the C with which each interval would just have held, where the doubt counts at all; of
+    a part of the records."""
     rows = []
-    for record in records:
-        for found in record["boundaries"] if record["differentiable"] or quantity == "value" else ():
-            doubt = found["doubts"][quantity]
-            for d, spread, t in _pairs(found, quantity):
-                if d is not None and t is not None and doubt > _COUNTS * d:
-                    sampled = 1 + SURE * spread
-                    below, above = max(d / sampled - t, 0.0), math.sqrt(max(t**2 - (d * sampled) ** 2, 0.0))
-                    rows.append((found["fall"], below / doubt, above / doubt))
+    for found in _estimated(records, quantity, part):
+        doubt = found["doubts"][quantity]
+        for d, spread, t in _pairs(found, quantity):
+            if d is not None and t is not None and doubt > _COUNTS * d:
+                sampled = 1 + SURE * spread
+                below, above = max(d / sampled - t, 0.0), math.sqrt(max(t**2 - (d * sampled) ** 2, 0.0))
+                rows.append((found["fall"], below / doubt, above / doubt))
     return np.array(rows).reshape(-1, 3)
+
+
+def _estimated(records: Sequence[Record], quantity: str, part: str | None) -> Iterator[Mapping[str, Any]]:
+    """What was estimated under each boundary, or that part of it, where it is and has the quantity."""
+    for record in records:
+        if record["differentiable"] or quantity == "value":
+            for found in record["boundaries"]:
+                if part is None or part in found:
+                    yield found if part is None else found[part]
 
 
 def _pairs(found: Mapping[str, Any], quantity: str) -> list[list[Any]]:
@@ -359,6 +446,9 @@ def _quantiles(rows: np.ndarray) -> tuple[list[float], ...]:
     ends = (-math.inf, *FALLS, math.inf)
     near = [rows[(rows[:, 0] >= low) & (rows[:, 0] <= high), 1:] for low, high in zip(ends[:-2], ends[2:], strict=True)]
     return tuple(
-        [float(np.quantile(found[:, column], part)) if len(found) else math.inf for found in near]
-        for column, part in ((0, _HELD), (1, _HELD), (1, _LIKELY))
+        [_quantile(found[:, column], part) for found in near] for column, part in zip((0, 1, 1), _PARTS, strict=True)
     )
+
+
+def _quantile(values: np.ndarray, part: float) -> float:
+    return float(np.quantile(values, part)) if len(values) else math.inf

@@ -28,6 +28,7 @@ from filterlab.signals import Signal, ValueAndGradient
 _CHUNK = 20_000  # points at a time
 _APART = 1e-3  # voxels between the gradients that a second derivative is taken from
 _WAVES = 64
+_MOVES = 4  # of at most a voxel, onto a surface
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,18 @@ class Subject:
     second_derivative: Tensor
     signal: Signal
     differentiable: bool = True
+
+    def on_surface(self, level: float, points: Tensor, weights: Tensor) -> Subject:
+        """Of points near a surface of the truth, moved onto it along its gradient; no second derivatives."""
+        at = points.double()
+        for _ in range(_MOVES):
+            value, gradient = self.signal.value_and_gradient(at)
+            slope = gradient.norm(dim=-1).clamp_min(1e-300)
+            at = at - (((value - level) / slope).clamp(-1, 1) / slope)[:, None] * gradient
+        at = at.float()
+        value, gradient = self.signal.value_and_gradient(at.double())
+        bend = torch.zeros_like(value)
+        return replace(self, points=at, weights=weights, value=value, gradient=gradient, second_derivative=bend)
 
 
 @dataclass(frozen=True)

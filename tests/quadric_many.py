@@ -1,11 +1,13 @@
 """Many rays of every class at quadrics and at bilinear quads of every class, judged in float64, and exactly where not.
 
-python -m tests.quadric_many 1e7 [seed]     so many rays of each class; prints what was missed or invented
+python -m tests.quadric_many 1e7 [seed] [quadrics | quads]     so many rays of each class; prints what was missed or
+                                                                invented, of both or of one of them
 
 A ray is judged at once where float64 tells all that `quadric_oracle` would. What that lets rounding move is 200 units
 of the terms of a sum; what is computed here is off by ten at most, and a tenth is left on both sides of every bound:
 signs and hits are certain beyond that. All that is left, and whatever seems wrong, goes to the oracle's 400 bits, and
-only that may say that a hit is missed or invented.
+only that may say that a hit is missed or invented. Rays at patches are judged in 64 bits; what those leave open is
+counted.
 """
 
 from __future__ import annotations
@@ -244,7 +246,10 @@ SURE = 1e-12  # of the size, and by how steeply a ray meets a patch, how far u a
 
 
 def patch(rng: Rng, height: float) -> np.ndarray:
+    """A quarter of them parallelograms, an eighth triangles, but for their heights."""
     flat = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]) + 0.12 * rng.normal(size=(4, 3))
+    kind = rng.integers(8)
+    flat[2] = flat[1] + flat[3] - flat[0] if kind < 2 else flat[1] if kind == 2 else flat[2]
     flat[:, 2] = height * (rng.uniform(size=4) - 0.5)
     return flat @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + rng.uniform(-50, 50, 3)
 
@@ -257,7 +262,8 @@ def on_patch(corners: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def crossings_of_patch(corners: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """t (R, 2), by how much rounding may move it, and whether (R, 2) they surely are hits, and may be: by the lines of
-    constant v that are met."""
+    constant v that are met. A ray that touches, or may, has the same twice, that may be a hit; one that lies in a flat
+    patch to within rounding may hit it anywhere."""
     e, v = (x.astype(Long) for x in rays)
     p1, p2, p3, p4 = corners.astype(Long)
     v = v / np.sqrt((v * v).sum(1, keepdims=True))
@@ -265,51 +271,93 @@ def crossings_of_patch(corners: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.
     q = e + start[:, None] * v - p1
     a, d, h = p2 - p1, p4 - p1, p1 - p2 + p3 - p4
     moment, side = np.cross(q, v), np.cross(np.broadcast_to(d, v.shape), v)
-    c0, c1, c2 = moment @ a, moment @ h - side @ a, -(side @ h)
+    c0, c1, c2 = moment @ a, (moment @ h - side @ a) / 2, -(side @ h)
+    slack = SURE * (np.abs(c0) + 2 * np.abs(c1) + np.abs(c2) + SURE)
+    square = c1 * c1 - c0 * c2
+    touches = (np.abs(square) <= slack)[:, None]
     with np.errstate(all="ignore"):
-        s = np.sqrt(c1 * c1 - 4 * c0 * c2)
-        k = -(c1 + np.where(c1 > 0, s, -s)) / 2
-        w = np.stack((k / c2, c0 / k), 1)  # v of lines that are met
+        s = np.sqrt(square)
+        k = -(c1 + np.where(c1 > 0, s, -s))
+        w = np.where(touches, (-c1 / c2)[:, None], np.stack((k / c2, c0 / k), 1))  # v of lines that are met
         line = a + w[..., None] * h
         n = np.cross(v[:, None], line)
         way = w[..., None] * d - q[:, None]
         square = (n * n).sum(-1)
         u = (np.cross(way, v[:, None]) * n).sum(-1) / square
         t = (np.cross(way, line) * n).sum(-1) / square + start[:, None]
-        off = SURE * (1 + 1 / np.abs(s))[:, None] / np.sqrt(square) + SURE * np.abs(start)[:, None] * 1e-4
+        moved = np.where(touches, np.sqrt(2 * slack)[:, None] / np.abs(c2)[:, None], SURE / np.abs(s)[:, None])
+        off = (SURE + moved) / np.sqrt(square) + SURE * np.abs(start)[:, None] * 1e-4
         inner = np.minimum(np.minimum(u, 1 - u), np.minimum(w, 1 - w))
         ahead = t > 1e-9
-        return t, 10 * off, (inner > off) & ahead, (inner > -off) & ahead
+        lies = (np.abs((c0, c1, c2)).max(0) <= 10 * SURE)[:, None]
+        t, off = np.where(lies, start[:, None], t), np.where(lies, 2, off)
+        nearest = np.clip(w, 0, 1)  # for one that touches: a ray may be at right angles with a flat patch's normal
+        meets = np.abs((c2[:, None] * nearest + 2 * c1[:, None]) * nearest + c0[:, None]) <= 10 * SURE
+        may = (inner > -off) & ahead & (meets | ~touches) | lies
+        return t, 10 * off, (inner > off) & ahead & ~touches & ~lies, may
 
 
-def patch_verdict(height: float, count: int, seed: int) -> Counts:
-    """Of rays at one patch, at points of it and beside it, 3 to 3,000 sizes away."""
-    rng = np.random.default_rng([seed, int(-np.log10(height + 1e-20))])
-    corners = patch(rng, height)
+def at_points(rng: Rng, corners: np.ndarray, count: int) -> Rays:
+    """From anywhere, 3 to 3,000 sizes away, at points of a patch and beside it."""
     aim = on_patch(corners, *rng.uniform(-0.2, 1.2, (2, count)))
     way = ways(rng, count)
-    origins = aim - 3 * 1000 ** rng.uniform(0, 1, (count, 1)) * way
-    t, moved, surely, may = crossings_of_patch(corners, (origins, way))
-    surface = BilinearQuads(torch.from_numpy(corners), torch.tensor([[0, 1, 2, 3]]))
-    hits = surface.hits(torch.from_numpy(origins), torch.from_numpy(way), 3).t.numpy()
+    return aim - 3 * 1000 ** rng.uniform(0, 1, (count, 1)) * way, way
+
+
+def glancing(rng: Rng, corners: np.ndarray, count: int) -> Rays:
+    """In the tangent plane of a point, off by 1 to 1e-12 in place and way."""
+    a, b, c, d = corners
+    u, v = rng.uniform(-0.1, 1.1, (2, count, 1))
+    line, other = (1 - v) * (b - a) + v * (c - d), (1 - u) * (d - a) + u * (c - b)
+    turn, off = rng.uniform(0, 2 * np.pi, (count, 1)), 10.0 ** -rng.uniform(0, 12, (2, count, 1))
+    way = np.cos(turn) * line + np.sin(turn) * other + off[0] * ways(rng, count)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    aim = on_patch(corners, u[:, 0], v[:, 0]) + off[1] * ways(rng, count)
+    return aim - 3 * 1000 ** rng.uniform(0, 1, (count, 1)) * way, way
+
+
+AT_PATCHES: dict[str, Callable[[Rng, np.ndarray, int], Rays]] = {f.__name__: f for f in (at_points, glancing)}
+
+
+def patch_verdict(height: float, rays: str, count: int, seed: int) -> Counts:
+    """Of so many rays at one patch: hits expected, left open, missed, invented; of float32 rays as of quadrics."""
+    rng = np.random.default_rng([seed, int(-np.log10(height + 1e-20)), sorted(AT_PATCHES).index(rays)])
+    corners = patch(rng, height)
+    given = AT_PATCHES[rays](rng, corners, count)
+    t, moved, surely, may = crossings_of_patch(corners, given)
+    hits = cast_at_patch(corners, given)
     with np.errstate(all="ignore"):
         near = np.abs(hits[:, :, None] - np.where(may, t, np.nan)[:, None]) <= moved[:, None]
-    missed = surely & ~near.any(1)
-    invented = np.isfinite(hits) & ~near.any(2)
-    undecided = (may & ~surely).sum()
-    return {
-        "rays": count,
-        "expected": int(surely.sum()),
-        "missed": int(missed.sum()),
-        "invented": int(invented.sum()),
-        "undecided": int(undecided),
-    }
+    total: Counts = {"rays": count, "expected": int(surely.sum()), "open": int((may & ~surely).sum())}
+    total |= {"missed": int((surely & ~near.any(1)).sum()), "invented": int((np.isfinite(hits) & ~near.any(2)).sum())}
+    return total | patch_in_float32(corners, given)
+
+
+def patch_in_float32(corners: np.ndarray, rays: Rays) -> Counts:
+    """`of_float32`, of a patch."""
+    single = tuple(x.astype(np.float32) for x in rays)
+    t, moved, surely, _ = crossings_of_patch(corners, single)
+    hits = cast_at_patch(corners, single)
+    far = FAR * (np.linalg.norm(single[0] - corners.mean(0), axis=1) + 1)[:, None]
+    with np.errstate(all="ignore"):
+        off = np.abs(hits[:, :, None] - t[:, None]).min(1, initial=np.inf)
+    steady = surely & (moved < 5e-4 * far)
+    missed = surely & ~(off <= far + moved)
+    worst = float((off / far)[steady].max(initial=0.0))
+    return {"float32": int(surely.sum()), "float32 off": int(missed.sum()), WORST: worst}
+
+
+def cast_at_patch(corners: np.ndarray, rays: Rays) -> np.ndarray:
+    """t (R, k) of all hits, in units of length."""
+    surface = BilinearQuads(torch.from_numpy(corners), torch.tensor([[0, 1, 2, 3]]))
+    origins, ways = (torch.from_numpy(x) for x in rays)
+    return surface.hits(origins, ways, 3).t.double().numpy() * np.linalg.norm(rays[1].astype(float), axis=1)[:, None]
 
 
 HEIGHTS = (1.0, 1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 0.0)
 
 
-def main(count: int, seed: int = 0) -> None:
+def at_quadrics(count: int, seed: int) -> None:
     totals: dict[str, Counts] = {}
     for rays in RAYS:
         for number in range(seed, seed + max(1, count // (AT_ONCE * len(QUADRICS)))):
@@ -318,11 +366,26 @@ def main(count: int, seed: int = 0) -> None:
                 for name in (f"rays {rays}", f"quadrics {kind}", f"{rays} at {kind}"):
                     add(totals.setdefault(name, {}), own)
         print(f"rays {rays}", totals[f"rays {rays}"], flush=True)
-    for height in HEIGHTS:
-        for number in range(seed, seed + max(1, count // (10 * AT_ONCE))):
-            add(totals.setdefault(f"quads, height {height:g}", {}), patch_verdict(height, 10 * AT_ONCE, number))
     for name, total in totals.items():
         print(name, total)
+
+
+def at_quads(count: int, seed: int) -> None:
+    for rays in AT_PATCHES:
+        for height in HEIGHTS:
+            total: Counts = {}
+            for number in range(seed, seed + max(1, count // AT_ONCE)):
+                add(total, patch_verdict(height, rays, AT_ONCE, number))
+            print(f"quads, height {height:g}, {rays}", total, flush=True)
+
+
+SURFACES = {"quadrics": at_quadrics, "quads": at_quads}
+
+
+def main(count: int, seed: int = 0, only: str | None = None) -> None:
+    for name, many in SURFACES.items():
+        if only in (None, name):
+            many(count, seed)
 
 
 def add(total: Counts, own: Counts) -> None:
@@ -331,4 +394,4 @@ def add(total: Counts, own: Counts) -> None:
 
 
 if __name__ == "__main__":
-    main(int(float(sys.argv[1])), *map(int, sys.argv[2:]))
+    main(int(float(sys.argv[1])), *map(int, sys.argv[2:3]), *sys.argv[3:])

@@ -169,6 +169,13 @@ def test_every_op_has_its_parts():
             assert (PACKAGE / "ops" / room / f"{op}.py").is_file(), f"{op} has no {room or 'description'}"
 
 
+def test_what_stands_in_leaves_has_its_parts():
+    """A description, a plain twin, vector code, and a program for a GPU; derivatives are those of all surfaces."""
+    for op in ("quadrics", "bilinear", "slim"):
+        for room in ("", "reference", "cpu", "cuda"):
+            assert (PACKAGE / "ops" / room / f"{op}.py").is_file(), f"{op} has no {room or 'description'}"
+
+
 def test_the_library_imports_neither_experiments_nor_tests():
     outside = {"experiments", "tests", "benchmarks"}
     found = {path: {m for m in imported_modules(path) if m.split(".")[0] in outside} for path in SOURCES}

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.differentiable import quadrics as ops
-from filterlab.render import PerspectiveCamera, raycast
+from filterlab.render import OrthographicCamera, PerspectiveCamera, raycast
 from filterlab.surfaces import BilinearQuads, Quadrics, Tetrahedra
 
 F64 = torch.float64
@@ -232,6 +232,65 @@ def test_a_ray_in_a_flat_patch_does_not_hit_it():
     assert not surface.hit(torch.tensor([-1, 0.5, 0]).double(), torch.tensor([1, 0, 0.0]).double()).valid
 
 
+Cast = tuple[ops.InLeaves, Tensor, Tensor, Tensor]
+"""Patches, origins, directions, and whether a ray hits."""
+
+
+def above_a_square(tilt: float, count: int = 200) -> Cast:
+    """And parallel to it but for so much, as of the sides of a box that is seen from the front."""
+    turn = torch.linalg.qr(numbers(3, 3, seed=3))[0]
+    turned = lambda x: (x[..., None, :] * turn).sum(-1)  # noqa: E731
+    above = torch.cat((within(count, 2, seed=21), 0.01 + 0.4 * within(count, 1, seed=22)), 1)
+    way = torch.cat((numbers(count, 2, seed=23), tilt * numbers(count, 1, seed=24)), 1)
+    way = turned(way / way.norm(dim=1, keepdim=True))
+    cast = BilinearQuads(turned(SQUARE), torch.tensor([[0, 1, 2, 3]])).described
+    return cast, turned(above) - 5 * way, way, torch.zeros(count, dtype=torch.bool)
+
+
+def at_tips(row: list[int], count: int = 120) -> Cast:
+    """Of a triangle: 1e-10 within, and beside."""
+    vertices = numbers(3, 3, seed=25)
+    corner = vertices.repeat(count // 3 + 1, 1)[:count]
+    into = torch.nn.functional.normalize(vertices.mean(0) - corner, dim=1)
+    way = torch.nn.functional.normalize(numbers(count, 3, seed=26), dim=1)
+    hit = torch.arange(count) % 2 == 0
+    o = corner + torch.where(hit, 1e-10, -1e-10)[:, None] * into - 2 * way
+    return BilinearQuads(vertices, torch.tensor([row])).described, o, way, hit
+
+
+def along_lines(count: int = 200) -> Cast:
+    """Of a triangle, 1e-9 above them, and falling by 1e-11 to 1e-13 a unit of length only."""
+    vertices = numbers(3, 3, seed=25)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(*(vertices[1:] - vertices[0])), dim=0)
+    foot = torch.lerp(vertices[0], vertices[1], within(count, 1, seed=27))
+    way = torch.nn.functional.normalize(vertices[2] - foot, dim=1)
+    falls = 10.0 ** -(11 + 2 * within(count, 1, seed=28))
+    o = foot + 1e-9 * normal + 1e-7 * numbers(count, 3, seed=29) * way - 3 * way
+    cast = BilinearQuads(vertices, torch.tensor([[0, 1, 2, 2]])).described
+    return cast, o, way - falls * normal, torch.zeros(count, dtype=torch.bool)
+
+
+AT_EDGES: dict[str, Cast] = {f"tilt {tilt:g}": above_a_square(tilt) for tilt in (0, 1e-15, 1e-9, 1e-7, 1e-4)}
+AT_EDGES |= {f"tips {row}": at_tips(row) for row in ([0, 1, 2, 2], [0, 0, 1, 2], [0, 1, 1, 2], [0, 1, 2, 0])}
+
+
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("cast", AT_EDGES)
+def test_flat_patches_end_where_they_do(cast, implementation):
+    """Beside them, and at tips of triangles, where α, β, γ are 0 to within rounding, or nearly."""
+    given, o, d, expected = AT_EDGES[cast]
+    assert torch.equal(ops.hits(given, o, d, 1, implementation=implementation)[1][:, 0] >= 0, expected)
+
+
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+def test_lines_of_a_triangle_that_a_ray_follows_are_seldom_hit(implementation):
+    """Rounding may move a ray and its line by more than is between them, but not to the ends of the line."""
+    given, o, d, _ = along_lines()
+    t = ops.hits(given, o, d, 1, implementation=implementation)[0]
+    assert 200 - int(t.isinf().sum()) <= 10
+    assert ((t > 2.9) & (t < 5) | t.isinf()).all()
+
+
 def test_the_program_does_what_plain_torch_does():
     vertices, faces = ball(8, 0.3)
     o, d = 3 + 2 * numbers(3000, 3, seed=17), numbers(3000, 3, seed=18)
@@ -250,6 +309,18 @@ def test_an_image():
     assert 0.2 < float(covered.mean()) < 0.7
     assert bool(image["color"].isfinite().all())
     assert (image["normal"].norm(dim=-1) - covered).abs().max() < 1e-6
+
+
+def test_a_box_seen_along_its_faces():
+    """Turned anyhow, so that rays along faces are at right angles with their normals to within rounding only."""
+    turn = torch.linalg.qr(numbers(3, 3, seed=30))[0]
+    ends = torch.tensor([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=F64) - 0.5
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    box = BilinearQuads((ends[..., None, :] * turn).sum(-1), torch.tensor(quads))
+    way, up = ([float(x) for x in turn[:, k]] for k in (0, 2))
+    camera = OrthographicCamera(position=tuple(-3 * x for x in way), target=(0, 0, 0), up=tuple(up), height=1.6)
+    image = raycast(box, camera, size=(32, 32), dtype=F64)
+    assert float(image[..., 3].sum()) == 20**2
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
@@ -15,7 +17,7 @@ from filterlab.ops.differentiable.prefilter import implementation_for, prefilter
 from filterlab.prefilters import PREFILTERS
 from filterlab.render import Light, PerspectiveCamera, Phong, Shading, Silhouettes, TransferFunction, raycast, render
 from filterlab.roots import all_roots, first_root
-from filterlab.surfaces import HeightField, LevelSet, Quadrics, Slim, Surface
+from filterlab.surfaces import BilinearQuads, HeightField, LevelSet, Quadrics, Slim, Surface
 from filterlab.surfaces.quartic import SPLINES as QUARTIC
 from filterlab.volume import Boundary, Volume
 from tests.test_methods import CONTINUOUS
@@ -182,27 +184,45 @@ def test_hits_and_their_derivatives(method: str, dtype: torch.dtype) -> None:
         torch.testing.assert_close(b, a, rtol=0, atol=limit, msg=lambda t, name=name: f"{name}: {t}")
 
 
-@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
-def test_quadrics(dtype: torch.dtype) -> None:
-    """Hits, in order, and derivatives to centres."""
-    rng = torch.Generator().manual_seed(2)
-    centers, radii = 5 * torch.rand(300, 3, generator=rng).double(), 0.1 + 0.4 * torch.rand(300, generator=rng).double()
-    origins, ends = (8 * torch.rand(2, 2000, 3, generator=rng).double() - 1.5).to(dtype)
+def _assert_sheets_are_those_of_the_cpu(
+    build: Callable[[Tensor], Surface], given: Tensor, rays: tuple[Tensor, Tensor]
+) -> None:
+    """Hits, in order, and derivatives to what a surface is built of."""
     found = []
     for device in ("cpu", "cuda"):
-        c = centers.to(device).requires_grad_()
-        surface = Quadrics.ellipsoids(c, radii.to(device))
-        o, d = origins.to(device), (ends - origins).to(device)
+        x = given.to(device).requires_grad_()
+        surface = build(x)
+        o, d = (r.to(device) for r in rays)
         hits = surface.hits(o, d, 3)
         at = surface.at(o, d, hits)
         steep = hits.valid & ((at.normal * d[:, None]).sum(-1).abs() > 0.2)
-        (gradient,) = torch.autograd.grad(torch.where(steep, hits.t, 0).sum(), c)
+        (gradient,) = torch.autograd.grad(torch.where(steep, hits.t, 0).sum(), x)
         found.append((hits.piece, torch.where(hits.valid, hits.t, 0), gradient))
     (piece, t, gradient), on_gpu = found
     assert torch.equal(on_gpu[0].cpu(), piece)
     assert_same(on_gpu[1], t)
-    limit = TOLERANCE[dtype] * float(gradient.abs().max())  # t is rounded to it
+    limit = TOLERANCE[rays[0].dtype] * float(gradient.abs().max())  # t is rounded to it
     torch.testing.assert_close(on_gpu[2].cpu(), gradient, rtol=0, atol=limit)
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+def test_quadrics(dtype: torch.dtype) -> None:
+    rng = torch.Generator().manual_seed(2)
+    centers, radii = 5 * torch.rand(300, 3, generator=rng).double(), 0.1 + 0.4 * torch.rand(300, generator=rng).double()
+    origins, ends = (8 * torch.rand(2, 2000, 3, generator=rng).double() - 1.5).to(dtype)
+    build = lambda x: Quadrics.ellipsoids(x, radii.to(x))  # noqa: E731
+    _assert_sheets_are_those_of_the_cpu(build, centers, (origins, ends - origins))
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+def test_bilinear_quads(dtype: torch.dtype) -> None:
+    rng = torch.Generator().manual_seed(9)
+    quads = torch.arange(1200).view(300, 4)
+    square = torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]).double()
+    places = 5 * torch.rand(300, 1, 3, generator=rng) + 0.3 * torch.randn(300, 4, 3, generator=rng)
+    origins, ends = (8 * torch.rand(2, 2000, 3, generator=rng).double() - 1.5).to(dtype)
+    build = lambda x: BilinearQuads(x, quads.to(x.device))  # noqa: E731
+    _assert_sheets_are_those_of_the_cpu(build, (square + places).view(-1, 3), (origins, ends - origins))
 
 
 def _of_surface(surface: Surface, x: Tensor, origins: Tensor, directions: Tensor) -> dict[str, Tensor]:

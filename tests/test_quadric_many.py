@@ -53,16 +53,18 @@ def test_hits_that_are_invented_are_noticed(monkeypatch):
     assert quadric_many.verdict("ellipsoid", "eyes", 50, 0)["invented"] > 20
 
 
+@pytest.mark.parametrize("rays", quadric_many.AT_PATCHES)
 @pytest.mark.parametrize("height", quadric_many.HEIGHTS)
-def test_rays_at_patches_are_judged(height):
-    found = quadric_many.patch_verdict(height, 2000, 3)
-    assert found["missed"] == found["invented"] == 0, found
-    assert found["undecided"] < 5
-    assert found["expected"] > 500
+def test_rays_at_patches_are_judged(height, rays):
+    found = quadric_many.patch_verdict(height, rays, 2000, 3)
+    assert found["missed"] == found["invented"] == found["float32 off"] == 0, found
+    assert found["open"] < 5 if rays == "at_points" else found["open"] < 400
+    assert min(found["expected"], found["float32"]) > 300
 
 
 def test_patches_with_other_corners_are_noticed(monkeypatch):
     real = quadric_many.BilinearQuads
-    monkeypatch.setattr(quadric_many, "BilinearQuads", lambda corners, quads: real(corners + 1e-6, quads))
-    found = quadric_many.patch_verdict(0.1, 500, 3)
+    monkeypatch.setattr(quadric_many, "BilinearQuads", lambda corners, quads: real(corners + 1e-3, quads))
+    found = quadric_many.patch_verdict(0.1, "at_points", 500, 3)
     assert min(found["missed"], found["invented"]) > 100
+    assert found["float32 off"] > 30

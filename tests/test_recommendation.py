@@ -188,6 +188,29 @@ def test_a_ramp_needs_no_more_than_trilinear(boundary) -> None:
     assert answer.pick.method == "trilinear"
 
 
+def test_of_a_level_the_errors_are_those_next_to_its_surface() -> None:
+    """A ball whose surface is a tanh: most of the volume is even, and all errors are at the surface."""
+    n, radius, width = 40, 11.3, 2.2
+    center = torch.tensor([19.2, 20.4, 18.7], dtype=torch.float64)
+
+    def function(p: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        d = p - center
+        t = torch.tanh((radius - d.norm(dim=-1)) / width)
+        return 0.5 + 0.5 * t, (-0.5 * (1 - t * t) / width / d.norm(dim=-1))[..., None] * d
+
+    signal = Signal("ball", function, (-0.5,) * 3, (n - 0.5,) * 3)
+    volume = signal.sample(n).samples
+    directions = torch.nn.functional.normalize(torch.randn(4096, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    asked = {"task": "isosurface", "methods": ONE_OF_EACH_KIND, **FAST}
+    answer = recommend(volume, 1e-9, level=0.5, **asked)
+    check_held(answer, truths(answer, volume, signal, (center + radius * directions).float()))
+    anywhere = recommend(volume, 1e-9, **asked)
+    assert answer.best.error.measured > 1.5 * anywhere.best.error.measured
+    assert "next to the surface of 0.5" in report.sentences(answer)[0]
+    assert "next to" not in report.sentences(anywhere)[0]
+    assert report.data(answer)["level"] == 0.5
+
+
 def test_waves_near_the_nyquist_frequency() -> None:
     signal = waves(0.85, 32)
     volume = signal.sample(32).samples
@@ -273,7 +296,7 @@ def test_the_best_is_the_one_with_the_least_upper_end_whatever_it_costs() -> Non
     """Both may be exact, as far as the samples tell; the cheaper one is three times as far from the reference."""
     volume = fl.Volume(torch.rand(8, 8, 8))
     doubts = {"value": 0.05, "gradient": 0.05, "bend": 0.0}
-    yardstick = Yardstick(fl.Boundary.MIRROR, (0.0, 1.0), (), (), doubts, 0.0, 0.0, 0.0)
+    yardstick = Yardstick(fl.Boundary.MIRROR, (0.0, 1.0), None, (), (), doubts, 0.0, 0.0, 0.0)
     cheap, best = ("trilinear", "fused", None), ("tricubic", "fused", None)
     errors = {way: MethodErrors(Distance(rms), Distance(rms)) for way, rms in ((cheap, 0.03), (best, 0.01))}
     question = Question("resample", 1e-9, math.inf, math.inf, "mirror", "refuse")
@@ -510,6 +533,8 @@ def test_any_volume_gets_an_answer(volume) -> None:
         ({"max_memory": -1}, "max_memory must be positive; got -1"),
         ({"task": "print"}, "task must be one of resample, dvr, isosurface; got 'print'"),
         ({"methods": ["noch"]}, "unknown method 'noch'"),
+        ({"level": 0.5}, "level is that of an isosurface; got level=0.5 for task 'resample'"),
+        ({"level": 7.0, "task": "isosurface"}, "expected a level with a surface in the inner part .* got 7"),
     ],
 )
 def test_questions_without_sense(options, match, samples) -> None:
@@ -550,6 +575,11 @@ def test_the_command(samples, quick, tmp_path, capsys) -> None:
     assert answer["max_error"] == 0.9
     assert yaml.safe_load((tmp_path / "s.yaml").read_text())["method"]["name"] == answer["pick"]["method"]
     assert main(["render", str(tmp_path / "s.yaml"), "-o", str(tmp_path / "p.png"), "--size", "8", "8"]) == 0
+    surface = ["--task", "isosurface", "--level", "0.5"]
+    assert main(["recommend", str(file), "--max-error", "90%", *surface, "-o", str(tmp_path / "t.yaml")]) == 0
+    assert yaml.safe_load((tmp_path / "t.yaml").read_text())["surface"] == 0.5
+    assert main(["render", str(tmp_path / "t.yaml"), "-o", str(tmp_path / "q.png"), "--size", "8", "8"]) == 0
+    capsys.readouterr()
     assert main(["recommend", str(file), "--max-error", "0.000001%"]) == 3
     assert "Nothing is likely to meet the budget" in capsys.readouterr().out
 
@@ -607,6 +637,7 @@ def test_what_is_written_renders(volume, quick, monkeypatch, tmp_path) -> None:
         (["--max-error", "1%", "--max-memory", "3 parsec"], 2, "expected --max-memory"),
         (["--max-error", "1%", "--task", "dwr"], 1, "unknown task 'dwr'; did you mean 'dvr'?"),
         (["--max-error", "1%", "-o", "scene.png"], 1, "ends in .yaml"),
+        (["--max-error", "1%", "--level", "0.5"], 1, "expected --task isosurface, got resample"),
     ],
 )
 def test_mistakes_on_the_command_line(arguments, code, message, tmp_path, capsys) -> None:

@@ -117,6 +117,54 @@ def test_integers_are_as_coarse_in_a_part_as_in_the_whole(monkeypatch) -> None:
     assert parts == pytest.approx(whole, rel=0.25)
 
 
+@pytest.mark.parametrize("size", [*SIZES, (13, 20, 11)])
+def test_bricks_that_may_hold_a_level(size, monkeypatch) -> None:
+    """Those with samples on both sides, their own or next to them; looked for in slabs of a brick each."""
+    monkeypatch.setattr(survey, "_SLAB", 1)
+    samples = torch.rand(size, generator=torch.Generator().manual_seed(2))
+    for level in (0.02, 0.5, 0.97, 1.5):
+        found = survey._may_hold(level, samples, Boundary.MIRROR)
+        assert found.shape == tuple(-(-n // 4) for n in size)
+        for brick in torch.cartesian_prod(*(torch.arange(n) for n in found.shape)).reshape(-1, 3).tolist():
+            near = samples[tuple(slice(max(4 * b - 1, 0), 4 * b + 5) for b in brick)]
+            assert bool(found[tuple(brick)]) == bool(near.min() <= level <= near.max())
+
+
+@pytest.mark.parametrize("whole", [survey.WHOLE, 1000], ids=["whole", "in parts"])
+def test_points_of_a_level_are_spread_over_its_surface(whole, monkeypatch) -> None:
+    """On a sphere where the slope is 2.6 times as steep on one side as on the other; all points are on it."""
+    monkeypatch.setattr(survey, "WHOLE", whole)
+    center, radius = torch.tensor([19.2, 20.1, 21.7], dtype=torch.float64), 9.3
+    p = voxels((40, 42, 45)) - center
+    samples = (1 + 0.45 * p[..., 0] / radius) * (p.square().sum(-1) - radius**2)
+    patches = Yardstick.of(samples[None], None, Boundary.MIRROR, level=0.0).patches
+    starts = [torch.zeros(3)] if len(patches) == 1 else [found_in(samples, patch.samples) for patch in patches]
+    at = torch.cat([patch.points.double() + start for patch, start in zip(patches, starts, strict=True)]) - center
+    weights = torch.cat([patch.weights for patch in patches])
+    assert float(weights.sum()) == pytest.approx(1)
+    assert bool(((at.norm(dim=-1) - radius).abs() < 0.01).all())
+    mean = (weights[:, None] * at).sum(0) / radius
+    assert float(mean.abs().max()) < (0.04 if len(patches) == 1 else 0.35)
+
+
+def found_in(samples: torch.Tensor, part: torch.Tensor) -> torch.Tensor:
+    """Where the first voxel of a part lies in (D, H, W), x, y, z."""
+    first = (samples == part[0, 0, 0]).nonzero()
+    return next(
+        i
+        for i in first
+        if torch.equal(samples[tuple(slice(a, a + n) for a, n in zip(i, part.shape, strict=True))], part)
+    ).flip(0)
+
+
+def test_a_level_without_a_surface_is_refused() -> None:
+    samples = torch.rand(36, 36, 36, generator=torch.Generator().manual_seed(0))
+    samples[0, 0, 0] = 5.0  # outside of the region
+    for level in (3.0, 4.9, 5.1, -3.0, math.nan):
+        with pytest.raises(ValueError, match="expected a level with a surface in the inner part of the volume"):
+            Yardstick.of(samples[None], None, Boundary.MIRROR, level=level)
+
+
 def test_points_near_voxels_without_a_value_do_not_count() -> None:
     samples = lumpy((1, 20, 20, 20))
     unknown = torch.zeros(1, 20, 20, 20, dtype=torch.bool)
@@ -227,7 +275,7 @@ def test_what_samples_were_rounded_by_is_in_the_upper_end(dtype, offset) -> None
 def test_what_a_task_counts(task, fall) -> None:
     """The value; of others the value or the gradient, whichever is further off; of a march s² |f''| / 24 beside."""
     doubts = {"value": 0.02, "gradient": 0.03, "bend": 0.05}
-    yardstick = Yardstick(Boundary.MIRROR, (0.0, 1.0), (), (), doubts, 0.0, 0.4, fall)
+    yardstick = Yardstick(Boundary.MIRROR, (0.0, 1.0), None, (), (), doubts, 0.0, 0.4, fall)
     step = 0.7 if task == "dvr" else None
     lost = 0.0 if step is None else 0.49 / 24
     for value, gradient in ((0.2, 0.5), (0.5, 0.2)):
@@ -253,6 +301,6 @@ def test_a_sample_stands_for_its_step_but_for_a_24th_of_the_second_derivative() 
     within = (torch.arange(100, dtype=torch.float64) + 0.5) / 100 - 0.5
     lost = torch.cos(omega * (x[:, None] + step * within)).mean(1) - torch.cos(omega * x)
     bend = float((omega**2 * torch.cos(omega * x)).square().mean().sqrt())
-    yardstick = Yardstick(Boundary.MIRROR, (0.0, 1.0), (), (), dict.fromkeys(CALIBRATION, 0.0), 0.0, bend, 20.0)
+    yardstick = Yardstick(Boundary.MIRROR, (0.0, 1.0), None, (), (), dict.fromkeys(CALIBRATION, 0.0), 0.0, bend, 20.0)
     none = MethodErrors(Distance(0.0), Distance(0.0))
     assert float(lost.square().mean().sqrt()) == pytest.approx(yardstick.estimate("dvr", none, step).measured, rel=0.01)

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import filterlab as fl
 from filterlab.cli import main
 from filterlab.fields.base import Field
 from filterlab.io.config import ConfigError, loads_config
@@ -142,6 +143,27 @@ def test_auto_is_the_scene_that_it_stands_for() -> None:
 
 def test_a_step_of_the_scene_is_kept() -> None:
     assert build(loads_config(AUTO + "step: 0.3\n", Scene)).sampling.step == 0.3
+
+
+def test_auto_counts_the_errors_of_what_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, quick = [], building.recommend
+
+    def recommend(*arguments, **options):
+        asked.append(options)
+        return quick(*arguments, **options)
+
+    monkeypatch.setattr(building, "recommend", recommend)
+    start = AUTO[: AUTO.index("transfer:")]
+    for shown in ("surface: 0.25", "surface: {level: 0.5, axis: normalized}", "slice: z"):
+        build(loads_config(f"{start}{shown}\nsize: [4, 4]\n", Scene))
+    build(loads_config(AUTO, Scene))
+    middle = pytest.approx(sum(float(end) for end in fl.signals.sphere().sample(24).samples.aminmax()) / 2, abs=1e-6)
+    assert [(a["task"], a.get("level")) for a in asked] == [
+        ("isosurface", 0.25),
+        ("isosurface", middle),
+        ("resample", None),
+        ("dvr", None),
+    ]
 
 
 def test_auto_says_when_nothing_is_within_the_budget() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,12 @@ from torch import Tensor
 
 import filterlab as fl
 from filterlab import bernstein
+from filterlab.fields.ranges import ranges
 from filterlab.fields.tetrahedral_pieces import Planes
 from filterlab.methods import METHODS, Tetrahedral
+from filterlab.ops.bounds import in_pairs
+from filterlab.ops.differentiable import raycast as casting
+from filterlab.ops.raycast import Raycast, Sheets
 from filterlab.render import PerspectiveCamera, raycast
 from filterlab.surfaces import LevelSet
 from tests import tetrahedral_oracle
@@ -216,3 +221,41 @@ def test_fields_of_several_channels_are_selected_first():
     with pytest.raises(ValueError, match="select"):
         field.pieces_along(*ray)
     assert field.select(1, 0).pieces_along(*ray).ray.numel()
+
+
+KINDS = {
+    "as it is": {},
+    "integers": {"storage": "uint8"},
+    "parts of eight cubes": {"many": 1},
+    "in reverse": {"scale": -1.5},
+    "parts, in reverse": {"many": 1, "scale": -1.5},
+    "float32": {"dtype": torch.float32},
+}
+
+
+@every_spline
+@pytest.mark.parametrize("kind", KINDS)
+def test_trends_leave_out_no_hit(name, kind, monkeypatch):
+    """Against casting where nothing is known of them, all sheets of smooth data and of a noisy sample."""
+    own = KINDS[kind]
+    monkeypatch.setattr("filterlab.fields.ranges._MANY", own.get("many", 1 << 25))
+    z, y, x = np.indices(SHAPE)
+    smooth = torch.from_numpy(0.5 + 0.4 * np.sin(1.1 * x - 0.5 * y + 0.7 * z))
+    smooth[2, 3, 3] += 0.3
+    field = fl.reconstruct(smooth, name, storage=own.get("storage"))
+    o, d = (x.to(own.get("dtype", torch.float64)) for x in rays(1500))
+    given = field._raycast(0.45, o, d)
+    assert given.off_trend is not None
+    if "scale" in own:
+        lattice = replace(field.lattice, scale=own["scale"], shift=1.2)
+        known = ranges(lattice)
+        numbers = known.marks(0.5, o.dtype), known.edge, known.margin(o.dtype), known.off_trend
+        given = Raycast(lattice, given.geometry, 0.5, o.dtype, *numbers)
+    nothing = torch.full_like(given.off_trend, torch.nan, dtype=torch.float64)
+    everything = replace(given, off_trend=in_pairs(nothing, nothing))
+    tolerance = 1e-4 if o.dtype == torch.float32 else 1e-11
+    found, all_ = (casting.sheets(x, o, d, Sheets(4, False, 20.0), "cpu") for x in (given, everything))
+    assert torch.equal(found < torch.inf, all_ < torch.inf)
+    hit = found < torch.inf
+    assert 0.2 < float(hit[:, 0].double().mean()) < 1
+    assert float((found - all_)[hit].abs().max()) <= tolerance

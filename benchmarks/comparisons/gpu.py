@@ -26,11 +26,11 @@ from filterlab import ops
 from filterlab.kernels import bspline
 from filterlab.methods import METHODS, Tetrahedral, reconstruct
 from filterlab.names import SPLINES
-from filterlab.ops.differentiable import height_hits, heights
+from filterlab.ops.differentiable import height_hits, heights, quadrics
 from filterlab.ops.differentiable import slim as sheets
 from filterlab.ops.differentiable.prefilter import prefilter_samples
 from filterlab.roots import first_root
-from filterlab.surfaces import Slim
+from filterlab.surfaces import BilinearQuads, Slim
 
 _POINTS = 16  # times as many as elsewhere
 _IMAGE = 4  # times the edge
@@ -369,6 +369,36 @@ def _slim_direct(settings: Settings) -> Race:
     return Race(what, contestants, [Ratio("fused", "direct")], tolerance=1e-6)
 
 
+def _mesh(settings: Settings, rings: int) -> BilinearQuads:
+    vertices, faces = slim.quads(rings if not settings.quick else 6)
+    return BilinearQuads(torch.from_numpy(vertices).cuda(), torch.from_numpy(faces).cuda())
+
+
+def _quads(settings: Settings) -> Race:
+    """First hits and normals of quads through points of the same torus."""
+    meshes = {f"{len(mesh):,} quads": mesh for mesh in (_mesh(settings, rings) for rings in (45, 268))}
+    rays = _moved(slim.rays_of(slim.cover_of(settings, 5_000), _IMAGE * settings.image))
+    contestants = [
+        _finished(name, partial(hits_and_normals, mesh, *rays), None, len(rays[0])) for name, mesh in meshes.items()
+    ]
+    few, *many = meshes
+    given = meshes[few].described
+    contestants.append(_finished("program", lambda: quadrics.hits(given, *rays, 1), None, len(rays[0])))
+    what = f"a torus, {len(rays[0]):,} float32 rays: first hits and normals; hits of {few} alone: program"
+    return Race(what, contestants, [*(Ratio(name, few) for name in many), Ratio(few, "program")])
+
+
+def _quads_direct(settings: Settings) -> Race:
+    given = _mesh(settings, 45).described
+    rays = _moved(slim.rays_of(slim.cover_of(settings, 5_000), settings.image // 4))
+    by = lambda how: lambda: _finite(quadrics.hits(given, *rays, 1, implementation=how)[0])  # noqa: E731
+    contestants = [
+        _finished(n, by(how), "hits", len(rays[0])) for n, how in (("fused", "cuda"), ("direct", "reference"))
+    ]
+    what = f"a torus of 5,085 quads, {len(rays[0]):,} rays: first hits"
+    return Race(what, contestants, [Ratio("fused", "direct")], tolerance=1e-6)
+
+
 # --- roots ------------------------------------------------------------------------------------------------------------
 
 
@@ -404,6 +434,8 @@ _ITEMS: dict[str, tuple[float, Callable[[Settings], Race]]] = {
     "terrain-direct": (20, _terrain_direct),
     "slim": (5, _slim),
     "slim-direct": (20, _slim_direct),
+    "quads": (5, _quads),
+    "quads-direct": (20, _quads_direct),
     "roots-float32": (10, partial(_roots, dtype=torch.float32)),
     "roots-float64": (10, partial(_roots, dtype=torch.float64)),
 }

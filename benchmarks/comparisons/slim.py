@@ -60,6 +60,12 @@ def mesh_of(rms: float, rays: Rays) -> tuple[Any, int]:
 
 def triangles(rings: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices on the torus, and faces."""
+    vertices, faces = quads(rings)
+    return vertices, np.concatenate([faces[:, own] for own in ((0, 1, 2), (0, 2, 3))])
+
+
+def quads(rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices on the torus, and faces of four corners."""
     around = round(_AROUND * rings)
     u, v = 2 * np.pi * np.arange(around)[:, None] / around, 2 * np.pi * np.arange(rings) / rings
     across = MAJOR + MINOR * np.cos(v)
@@ -67,8 +73,7 @@ def triangles(rings: int) -> tuple[np.ndarray, np.ndarray]:
     i, j = np.arange(around)[:, None], np.arange(rings)
     at = lambda i, j: i % around * rings + j % rings  # noqa: E731
     corners = [np.broadcast_to(at(i + a, j + b), (around, rings)) for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
-    faces = np.stack([np.stack([corners[k] for k in own], -1) for own in ((0, 1, 2), (0, 2, 3))])
-    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+    return vertices.reshape(-1, 3), np.stack(corners, -1).reshape(-1, 4)
 
 
 def _first(settings: Settings) -> Race:

@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING, Any
 from matplotlib.axes import Axes
 
 from experiments.pictures import LEVELS
-from experiments.recommend_validation import FACTOR, HALVES, fitted
+from experiments.recommend_validation import FACTOR, HALVES, fitted, fitted_on_surfaces
 from experiments.report import plots
 from experiments.report.page import Block, Column, Plot, Section, Table
 from experiments.report.style import LOOKS, MISSING, fixed, look, text
 from experiments.runs import Record
-from filterlab.recommendation.calibration import CALIBRATION, FALLS
+from filterlab.recommendation.calibration import CALIBRATION, FALLS, SURFACE
 
 if TYPE_CHECKING:
-    from experiments.pictures import LEVELS
-from experiments.recommend_validation import Config
+    from experiments.recommend_validation import Config
 
 LEAD = (
     "On volumes whose truth is known, what filterlab recommend says is set against it: the interval of the error of "
     "every method and storage, and its answers to questions with a budget. A pick must keep the budget; a refusal is "
     "justified if nothing that was considered meets it. Of isosurfaces and dvr both are judged a second time by what a "
     "picture shows: errors are then those at the hits of its rays, which lie where the surface does, or those of the "
-    "segments of its march, weighted by what is seen of each, and not of anywhere in the volume.",
+    "segments of its march, weighted by what is seen of each, and not of anywhere in the volume. Where the "
+    "level is told, errors are estimated on its surface alone.",
     "Factors were fitted to the tuning half. What counts is the reporting half.",
 )
 BARS = {"holds": 0.95, "kept": 0.98, "justified": 0.95, "hard": None, "sure": None, "near": 0.80}
@@ -51,6 +51,8 @@ SHOWN = {
     "detail": "Such a level lies where the signal changes: more is wrong there than over the region, of which picks "
     "speak.",
 }
+_OF_LEVEL = " of that level"
+AIMED = f"isosurface{_OF_LEVEL}"
 TITLES = (
     "interval holds",
     "budget kept",
@@ -71,12 +73,13 @@ def draw(config: Config, records: Mapping[str, Record], _folder: Path) -> Sectio
     if volumes:
         blocks = [
             _verdict(volumes),
-            *(_in_pictures(volumes, task, level) for task in ("dvr", "isosurface") for level in LEVELS),
+            *(_in_pictures(volumes, task, level) for task in ("dvr", "isosurface", AIMED) for level in LEVELS),
             _groups(reporting, "Reporting half, by kind of volume.", lambda r, _: r["class"]),
             _groups(reporting, "Reporting half, by boundary.", lambda _, found: found["boundary"]),
             _groups(reporting, "Reporting half, by task.", None),
             _scatter(reporting),
             _calibration(volumes),
+            _on_surfaces(volumes),
             *_failures(reporting),
         ]
     return Section("Does recommend keep its word?", LEAD, blocks)
@@ -179,11 +182,12 @@ def _in_pictures(volumes: Sequence[Record], task: str, level: str) -> Table:
             _met(kinds[HALVES[1], False][name], None if name == "elsewhere" else PICTURED_BAR),
         ]
         for name, words in PICTURED_WORDS.items()
-        if name != "rendered" or task == "dvr"
+        if (name != "rendered" or task == "dvr") and (name != "elsewhere" or task != AIMED)
     ]
     caption = (
-        f"Task {task}, by what pictures show of levels drawn by {level}. {SHOWN[level]} Near: of budgets near the true "
-        f"errors. The last column judges the reporting half, budgets as people ask, by {100 * PICTURED_BAR:.0f} %."
+        f"Task {task}, by what pictures show of levels drawn by {level}. {SHOWN[level] if task != AIMED else ''} Near: "
+        f"of budgets near the true errors. The last column judges the reporting half, budgets as people ask, by "
+        f"{100 * PICTURED_BAR:.0f} %."
     )
     return Table([*columns, Column("")], rows, caption)
 
@@ -191,9 +195,10 @@ def _in_pictures(volumes: Sequence[Record], task: str, level: str) -> Table:
 def _pictured_answers(
     volumes: Sequence[Record], half: str, task: str, level: str, near: bool
 ) -> list[Mapping[str, Any]]:
-    asked = {"task": task, "level": level, "near": near}
+    asked = {"task": task.removesuffix(_OF_LEVEL), "level": level, "near": near}
     found = [found for record in volumes if record["half"] == half for found in record["boundaries"]]
-    return [a for f in found for a in f["answers"] if asked.items() <= a.items()]
+    answers = [a for f in found for a in f["answers"] if asked.items() <= a.items()]
+    return [{**a["aimed"], "pictured": a["aimed"]} for a in answers if "aimed" in a] if task == AIMED else answers
 
 
 def _groups(volumes: Sequence[Record], caption: str, key: Callable[[Record, Any], str] | None) -> Table:
@@ -270,6 +275,16 @@ def _calibration(volumes: Sequence[Record]) -> Table:
         "would just have held. By L is chosen."
     )
     return Table(columns, rows, caption)
+
+
+def _on_surfaces(volumes: Sequence[Record]) -> Table:
+    """By what these are multiplied where errors are those on a surface."""
+    columns = [Column("", numeric=False), *(Column(letter) for letter in "cCL")]
+    found, rows = fitted_on_surfaces(volumes), []
+    for quantity, used in SURFACE.items():
+        rows.append([f"of the {quantity}, in use", *(fixed(factor) for factor in used)])
+        rows.append(["fitted to the tuning half", *(fixed(factor) for factor in found[quantity])])
+    return Table(columns, rows, "On the surface of a level that is told, the factors above are multiplied by these.")
 
 
 def _failures(volumes: Sequence[Record]) -> Iterator[Table]:

@@ -28,6 +28,7 @@ class Recommend:
     examples:
       filterlab recommend engine.nrrd --max-error 0.5%
       filterlab recommend scan.nii.gz --max-error 1% --task dvr --max-memory 256MiB -o scene.yaml
+      filterlab recommend engine.nrrd --max-error 1% --task isosurface --level 90
       filterlab recommend scan.nii.gz --max-error 0.005 --json
     """
 
@@ -37,6 +38,8 @@ class Recommend:
     """The error that is allowed, in parts of the range of the volume's values: 0.5% or 0.005."""
     task: str = "resample"
     """What is done with it: resample (values), dvr or isosurface (gradients count as well)."""
+    level: Annotated[Maybe[float], arg(metavar="90")] = None
+    """Of the isosurface: errors are those next to it, not of the whole volume."""
     max_memory: Annotated[Maybe[str], arg(metavar="256MiB")] = None
     """What the coefficients may take, like 256MiB or 2GB."""
     max_time: Annotated[Maybe[str], arg(metavar="30s")] = None
@@ -73,6 +76,9 @@ class Recommend:
         ):
             check_name(what, name, known)
 
+        if self.level is not None and self.task != "isosurface":
+            raise ValueError(f"--level is that of an isosurface; expected --task isosurface, got {self.task}")
+
         with importing():
             from filterlab.io.volumes import describe
             from filterlab.methods import reconstruct
@@ -89,13 +95,14 @@ class Recommend:
             file = {"file": file, **chosen}
         look: dict[str, Any] = {}
         if self.output is not None:  # what would not render is refused before the work
-            look = suggested(reconstruct(volume, "trilinear", boundary=self.boundary, nan=self.nan))
+            look = suggested(reconstruct(volume, "trilinear", boundary=self.boundary, nan=self.nan), level=self.level)
             _check_scene(self.output, {"volume": file, **look})
         with progress_bar(self.quiet) as progress:
             found = recommend(
                 volume,
                 max_error,
                 task=self.task,
+                level=self.level,
                 max_memory=max_memory,
                 max_time=max_time,
                 boundary=self.boundary,

@@ -409,7 +409,7 @@ class GridField(Field):
         lattice = self.lattice
         bounds = ranges(lattice)
         marks, margin = bounds.marks(level, dtype), bounds.margin(dtype)
-        return Raycast(lattice, self.domain.geometry, level, dtype, marks, bounds.edge, margin)
+        return Raycast(lattice, self.domain.geometry, level, dtype, marks, bounds.edge, margin, bounds.off_trend)
 
     @property
     def _caster(self) -> str | None:

@@ -91,6 +91,7 @@ class Ranges:
         ends: the least and the greatest of all.
         largest: Σ |w| · max |c|, what rounding of a sum is relative to.
         edge: cells along an edge of a brick.
+        off_trend: of every part, as in `ops.bounds.Bounds`.
     """
 
     parts: Blocks
@@ -98,6 +99,7 @@ class Ranges:
     ends: tuple[float, float]
     largest: float
     edge: int
+    off_trend: Tensor | None = None
     _marks: dict[tuple[float, torch.dtype], Tensor] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -171,11 +173,11 @@ def ranges(lattice: AnyLattice, edge: int | None = None) -> Ranges:
 def _made(lattice: AnyLattice, edge: int) -> Ranges:
     least, most = _ends(lattice.coefficients.detach())
     codes = Codes.of(lattice, least, most)
-    low, high, ends = bounds(lattice, edge // 2, codes)
+    low, high, ends, off_trend = bounds(lattice, edge // 2, codes)
     if not lattice.continuous:  # a jump over a level lies between parts of which neither may hold it
         low, high = _with_neighbours(low, torch.minimum), _with_neighbours(high, torch.maximum)
     largest = abs(lattice.scale) * max(abs(least), abs(most)) * _norm(lattice) + abs(lattice.shift)
-    return Ranges(Blocks.of(low, high), codes, ends, largest, edge)
+    return Ranges(Blocks.of(low, high), codes, ends, largest, edge, off_trend)
 
 
 def _with_neighbours(codes: Tensor, choose: Callable[[Tensor, Tensor], Tensor]) -> Tensor:

@@ -33,12 +33,11 @@ from torch import Tensor
 from filterlab import bernstein, ops
 from filterlab.bernstein import Index, multi_indices
 from filterlab.fields.grid import NO_AXIS, Axes, Coefficients, Evaluation, Term, implementation_of
-from filterlab.fields.trends import Input, Piece, on_cubes, on_octahedra
 from filterlab.geometry import Geometry
 from filterlab.ops.differentiable.recording import plain, transformed
 from filterlab.ops.place import InWorld, Placement
 from filterlab.ops.reference.place import far_voxels
-from filterlab.ops.tetrahedra import Tetrahedra, TetrahedralStencil, Trend
+from filterlab.ops.tetrahedra import Tetrahedra, TetrahedralStencil
 from filterlab.volume import Boundary, all_between
 
 Vector = tuple[Fraction, Fraction, Fraction]
@@ -204,33 +203,7 @@ class Spline:
             barycentric=tuple(tuple(tuple(map(float, row)) for row in s.barycentric) for s in self.shapes),
             norm=float(self.norm),
             cuts=tuple((normal, float(d)) for normal, d in sorted(self._cuts())),
-            trend=self._trend,
         )
-
-    @property
-    def _trend(self) -> Trend:
-        return (on_cubes if self.jets is None else on_octahedra)(self.degree, self._pieces)
-
-    @property
-    def _pieces(self) -> list[Piece]:
-        """All that fill the cube about the sample 0."""
-        found, numbers = [], [self._in_numbers(shape) for shape in range(len(self.shapes))]
-        for number, turn, shift in self._about_sample:
-            vertices, masks = numbers[number]
-            moved = {a: _turned_inputs(mask, turn, int(2 * shift)) for a, mask in masks.items()}
-            found.append((np.array([turn(v) for v in vertices]) + float(shift), moved))
-        return found
-
-    def _in_numbers(self, number: int) -> Piece:
-        """A shape, and its coefficients by what stands at places of which twice the coordinates are told."""
-        shape, inputs = self.shapes[number], {}
-        if self.jets is None:
-            for a, mask in shape.masks.items():
-                inputs[a] = {((int(2 * x), int(2 * y), int(2 * z)), 0): float(w) for (x, y, z), w in mask.items()}
-        else:
-            for a, jets in self.jets[number].items():
-                inputs[a] = {((2 * x, 2 * y, 2 * z), row): float(w) for ((x, y, z), row), w in jets.items()}
-        return np.array(shape.vertices, dtype=float), inputs
 
     @property
     def _rules(self) -> list[Mapping[Index, Weights]]:
@@ -264,17 +237,6 @@ class Spline:
             for (number, turn), shift in product(self.tetrahedra, sorted({self.shift, -self.shift}))
             if all(abs(c + shift) <= Fraction(1, 2) for v in self.shapes[number].vertices for c in turn(v))
         ]
-
-
-def _turned_inputs(mask: Mapping[Input, float], turn: Turn, shift: int) -> dict[Input, float]:
-    """What stands at places, turned and moved, slopes with them."""
-    found = {}
-    for (place, row), weight in mask.items():
-        x, y, z = turn(place)
-        axis = turn.ranks.index(row - 1) if row else -1
-        sign = turn.signs[axis] if row else 1
-        found[(x + shift, y + shift, z + shift), axis + 1] = sign * weight
-    return found
 
 
 def _place(sample: Vector) -> tuple[int, int, int]:

@@ -5,13 +5,15 @@ h = p₁ − p₂ + p₃ − p₄. A ray q + ρ D, D of length 1, meets the line
 
     α u² + 2 β u + γ = 0,    γ = (Q × D)·d,    2 β = (Q × D)·h − (a × D)·d,    α = −(a × D)·h
 
-and then, with w = d + u h and n = D × w, v = ((u a − Q) × D)·n / n·n and ρ = ((u a − Q) × w)·n / n·n. Nothing in it
+and then, with w = d + u h and n = D × w, v = ((u a − Q) × D)·n / n·n and ρ = (u a + v w − Q)·D. Nothing in it
 is divided by how much a patch is bent, so that flat ones are no case of their own. a and d, u and v may change places:
-lines are taken of that family which the ray is less parallel to. q is nearest to the middle of the corners, as quadrics
-are recentred.
+lines are taken of that family whose edges the ray is less parallel to, for triangles the one whose lines all have a
+length. q is nearest to the middle of the corners, as quadrics are recentred.
 
 The edges are kept. u and v are off by rounding, and up to that count as within [0, 1], so that no ray slips through
-between two patches with an edge in common.
+between two patches with an edge in common. Where all of α, β, γ are small, u and v may be off by much; but then the ray
+meets the edge: the volume that D, the edge and the way between them span is 0 to within rounding. Points that are hit
+are S(u, v) with u and v in [0, 1], ρ where the ray is nearest to them.
 
 Source: Ramsey, Potter & Hansen, Ray bilinear patch intersections, 2004; Reshetov, Cool patches, 2019.
 """
@@ -32,6 +34,9 @@ CENTER, SQUARE, LENGTH, PLACE = slice(12, 15), 15, 16, 17
 
 ROUNDINGS = 8
 """Of the sizes of terms, up to which α, β, γ and places are off."""
+
+MEETING = 8
+"""Of L and by what places are off, up to which α u² + 2 β u + γ is 0: it is off by (1 + u)² at most, and twice that."""
 
 _BALL = 1 + 1e-9  # of the farthest corner, the radius of a ball that is never touched
 

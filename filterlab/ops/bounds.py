@@ -5,6 +5,9 @@ Bernstein coefficient of the tap's weight, axis by axis. That is exact about ker
 coefficients that overshoot: bounds of the taps alone let through up to ten times as many cells.
 
     coefficients ──▶ Bernstein coefficients of cells ──▶ least and greatest of parts of a few cells ──▶ codes of 16 bits
+
+Of splines on tetrahedra also between what f − t lies, t the trend of a cube (`ops.tetrahedra.trend_of`): where a ray
+goes, t and these tell more than bounds of all of the cube.
 """
 
 from __future__ import annotations
@@ -16,11 +19,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from filterlab.ops.tetrahedra import AnyLattice
+from filterlab.ops.tetrahedra import AnyLattice, TetrahedralLattice
 
 CODES = 1 << 16
 _USUAL = (0.0005, 0.9995)  # quantiles of coefficients that are told apart
 _WIDER = 0.5  # of what lies between them, on either side: Bernstein coefficients overshoot
+HALF_ROUNDING = 2.0**-7  # of bfloat16, as numbers are widened before they are rounded
 _ASKED = 24  # coefficients along each axis whose quantiles these are
 
 
@@ -31,11 +35,36 @@ class Bounds(NamedTuple):
         low, high: (pz, py, px) int16, codes of the least and the greatest coefficient of every part; the first and the
             last code where one is not finite.
         ends: the least and the greatest of all that are finite; of rounding alike.
+        off_trend: (pz, py, px) int32, for the cubes of every part the least and the greatest Bernstein coefficient of
+            f − t, as `in_pairs` has them; None where nothing reads it.
     """
 
     low: Tensor
     high: Tensor
     ends: tuple[float, float]
+    off_trend: Tensor | None = None
+
+
+def tells_off_trend(lattice: AnyLattice) -> bool:
+    """Whether `Bounds.off_trend` is read: by programs on the CPU that cast rays at splines on tetrahedra."""
+    return isinstance(lattice, TetrahedralLattice) and lattice.coefficients.device.type == "cpu"
+
+
+def in_pairs(low: Tensor, high: Tensor) -> Tensor:
+    """int32, two bfloat16 each, the low one in the lower half; rounded away from each other by up to 2⁻⁶ of their size.
+
+    Of NaN −∞ and ∞.
+    """
+    halves = []
+    for values, side in ((low, -1), (high, 1)):
+        wider = (values + side * HALF_ROUNDING * values.abs()).nan_to_num_(side * math.inf, math.inf, -math.inf)
+        halves.append(wider.float().bfloat16().view(torch.int16).int())
+    return (halves[0] & 0xFFFF) | (halves[1] << 16)
+
+
+def of_pairs(pairs: Tensor) -> tuple[Tensor, Tensor]:
+    """(low, high) float32."""
+    return (pairs << 16).view(torch.float32), (pairs & -0x10000).view(torch.float32)
 
 
 @dataclass(frozen=True)

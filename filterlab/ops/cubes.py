@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 from filterlab.ops.stencil import MultiIndex
-from filterlab.ops.tetrahedra import QUADRATICS, UNITS, Block, Sum, Turned, Value, at_centre
+from filterlab.ops.tetrahedra import UNITS, Sum, Turned, Value
 
 
 @dataclass(frozen=True)
@@ -99,59 +98,24 @@ class Cubes:
         start, end = (self.sum.barycentric(turned, local(self._at(way, t))) for t in (a, z))
         return Part(turned, start, end)
 
-    def trend(self, blocks: Sequence[Block], way: Way) -> tuple[list[Value], Value]:
-        """The quadratic near the spline: from where a way begins to where it ends, three Bernstein coefficients.
+    def along(self, quadratic: Mapping[MultiIndex, Value], way: Way) -> list[Value]:
+        """Coefficients of 1, τ, τ² on ways of Σ_m t_m x^m, t_m those of `QUADRATICS`.
 
-        With them the most that it is apart from the spline, anywhere in the cube.
-
-        Args:
-            blocks: the samples around the one in the middle; or those around `Trend.centres`, along the axes of space.
+        With v_i = t_i + Σ_(j≥i) t_ij start_j and w_i = Σ_(j≥i) t_ij step_j they are t_0 + start · v,
+        step · v + start · w and step · w.
         """
-        e, trend = self.arithmetic, self.spline.trend
-        numbers = self._of_centres(blocks, way) if way.odd else self._of_samples(blocks[0])
-        q = {m: self.sum.weighted(self._polar(m, row), numbers) for m, row in zip(QUADRATICS, trend.rows, strict=True)}
-        start, end = (self._turned_round(way, x) for x in (way.start, self._at(way, e.constant(1))))
-        at_start, at_end = self._linear(q, start), self._linear(q, end)
-        apart = None
-        for row in trend.apart:
-            own = e.absolute(self.sum.weighted(row, numbers))
-            apart = own if apart is None else e.add(apart, own)
-        return [self._affine(*at_start, start), self._affine(*at_start, end), self._affine(*at_end, end)], apart
+        v = [self._bent(quadratic, i, way.start, quadratic[unit]) for i, unit in enumerate(UNITS)]
+        w = [self._bent(quadratic, i, way.step, None) for i in range(3)]
+        linear = self._dot(way.start, w, self._dot(way.step, v, None))
+        return [self._dot(way.start, v, quadratic[0, 0, 0]), linear, self._dot(way.step, w, None)]
 
-    def _polar(self, m: MultiIndex, row: Sequence[float]) -> list[float]:
-        """Of a coefficient of q, its share in either argument of the polar form."""
-        return [w if m == (0, 0, 0) or max(m) == 2 else w / 2 for w in row]
+    def _bent(self, quadratic: Mapping[MultiIndex, Value], i: int, x: Sequence[Value], onto: Value | None) -> Value:
+        return self._dot([quadratic[_sum(UNITS[i], other)] for other in UNITS[i:]], x[i:], onto)
 
-    def _linear(self, q: Mapping[MultiIndex, Value], x: Sequence[Value]) -> tuple[Value, list[Value]]:
-        """q's polar form with x in one place: a number and three slopes in the other."""
-        one = [q[unit] for unit in UNITS]
-        slopes = [self._affine(one[i], [q[_sum(unit, other)] for other in UNITS], x) for i, unit in enumerate(UNITS)]
-        return self._affine(q[0, 0, 0], one, x), slopes
-
-    def _affine(self, number: Value, slopes: Sequence[Value], x: Sequence[Value]) -> Value:
-        for slope, own in zip(slopes, x, strict=True):
-            number = self.arithmetic.multiply_add(slope, own, number)
-        return number
-
-    def _of_centres(self, blocks: Sequence[Block], way: Way) -> list[Value]:
-        """The numbers that `Trend` describes, of octahedra."""
-        e, numbers = self.arithmetic, []
-        for block in blocks:
-            value, *slopes = at_centre(e, block).values()
-            numbers.append([value, *self._turned_round(way, slopes)])
-        half = len(blocks) // 2
-        opposite = list(zip(chain(*numbers[:half]), chain(*numbers[half:]), strict=True))
-        return [write(a, b) for write in (e.add, e.subtract) for a, b in opposite]
-
-    def _of_samples(self, block: Block) -> list[Value]:
-        """The numbers that `Trend` describes, of cubes."""
-        numbers = [block[at] for at in sorted(block)]  # z running fastest
-        for step in (9, 3, 1):
-            for first in (i for i in range(27) if i // step % 3 == 0):
-                own = slice(first, first + 3 * step, step)
-                low, middle, high = numbers[own]
-                numbers[own] = middle, self.arithmetic.add(low, high), self.arithmetic.subtract(high, low)
-        return numbers
+    def _dot(self, a: Sequence[Value], b: Sequence[Value], onto: Value | None) -> Value:
+        for x, y in zip(a, b, strict=True):
+            onto = self.arithmetic.multiply_add(x, y, onto)
+        return onto
 
     def _at(self, way: Way, t: Value) -> list[Value]:
         """The place at τ = t."""

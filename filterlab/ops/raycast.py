@@ -162,6 +162,7 @@ class Raycast:
             r of it, along every axis, may hold it.
         edge: cells along an edge of a brick, a power of two from 2 on.
         margin: what rounding may add to values.
+        off_trend: (pz, py, px) int32 of parts of `edge` / 2 cells, as in `ops.bounds.Bounds`; None: it is not read.
     """
 
     lattice: AnyLattice
@@ -171,6 +172,7 @@ class Raycast:
     marks: Tensor
     edge: int
     margin: float
+    off_trend: Tensor | None = None
 
 
 def marks_of(parts: Tensor) -> Tensor:

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import combinations, permutations, product
 from typing import Any, Protocol
 
+import numpy as np
 from torch import Tensor
 
 from filterlab.bernstein import Index
@@ -64,27 +65,6 @@ class Arithmetic(Protocol):
 
 
 @dataclass(frozen=True)
-class Trend:
-    """A quadratic q near a spline on the cube about a sample, and how near.
-
-    Of cubes both are made of the 27 numbers that samples are by their sums and differences: along each axis, x first,
-    the middle one, the sum of the other two, the one ahead less the one behind. Of octahedra, of what `at_centre` tells
-    of eight centres, along axes turned round where the sample's index is odd: for each of four centres the sums of its
-    value and slopes and those of the centre opposite; then so the differences.
-
-    Attributes:
-        centres: twice their places, from a sample at even indices, those opposite last; none of cubes.
-        rows: of q's coefficients of `QUADRATICS` in the place from the sample; the weights of these numbers.
-        apart: rows of weights as well: |f − q| is nowhere in the cube greater than the sum of what they give, each made
-            positive.
-    """
-
-    centres: tuple[Steps, ...]
-    rows: tuple[tuple[float, ...], ...]
-    apart: tuple[tuple[float, ...], ...]
-
-
-@dataclass(frozen=True)
 class Tetrahedra:
     """A spline as numbers: what a generator of code needs to know, and nothing else.
 
@@ -104,7 +84,6 @@ class Tetrahedra:
         norm: no value is larger than this times the largest sample.
         cuts: planes (n, d), n · v = d, that cut the cube |v| ≤ ½ about a sample into parts of one tetrahedron each; of
             octahedra about a sample at even indices, v turned round along the axes of odd ones.
-        trend: what is near it.
     """
 
     octahedral: bool
@@ -117,7 +96,6 @@ class Tetrahedra:
     barycentric: tuple[tuple[tuple[float, ...], ...], ...]
     norm: float
     cuts: tuple[tuple[Steps, float], ...]
-    trend: Trend
 
     @cached_property
     def shared(self) -> tuple[tuple[tuple[int, int, int], ...], tuple[tuple[float, ...], ...]]:
@@ -146,18 +124,22 @@ class Tetrahedra:
 
     @cached_property
     def masks_of_cube(self) -> tuple[tuple[float, ...], ...]:
-        """The masks of all coefficients of a cube, each once: weights of its block's samples, z running fastest."""
+        """The masks of coefficients of a cube, each once: weights of its block's samples, z running fastest.
+
+        Those halfway between two others are left out: what they give is neither the least nor the greatest.
+        """
         places, middle, found = list(product(range(self.size), repeat=3)), (self.size - 1) / 2, {}
         for mask, axes, signs in product(self.masks, permutations(range(3)), product((1, -1), repeat=3)):
             weights = {}
             for weight, (_, at) in zip(mask, self.inputs, strict=True):
                 weights[tuple(int(middle + s * (at[a] - middle)) for a, s in zip(axes, signs, strict=True))] = weight
             found[tuple(weights.get(place, 0.0) for place in places)] = None
-        return tuple(found)
+        every = list(found)
+        return tuple(every[i] for i in _outermost(every))
 
     @cached_property
     def masks_of_octahedra(self) -> tuple[tuple[tuple[Steps, Steps, float], ...], ...]:
-        """The masks of all coefficients of octahedra in a cube about a sample at even indices, each once.
+        """The same of octahedra in a cube about a sample at even indices.
 
         Returns:
             for each its terms: twice the centre of a block, from the sample; its number, as in `inputs`; the weight.
@@ -171,7 +153,37 @@ class Tetrahedra:
                     i, j, k = (unit[axis] for axis in axes)
                     terms[(x, y, z), (i, j, k)] = weight * (1 if unit == (0, 0, 0) else -side)
             found[tuple((*key, weight) for key, weight in sorted(terms.items()))] = None
-        return tuple(found)
+        every = [{(centre, unit): weight for centre, unit, weight in terms} for terms in found]
+        keys = sorted(set().union(*every))
+        kept, masks = _outermost([[own.get(key, 0.0) for key in keys] for own in every]), list(found)
+        return tuple(masks[i] for i in kept)
+
+    @cached_property
+    def moments(self) -> tuple[tuple[float, ...], ...]:
+        """For each of `masks_of_cube`, or `masks_of_octahedra`, the Bernstein coefficients of `QUADRATICS` there.
+
+        They are what the mask makes of their samples, less Δ / 8: of those of a quadratic q the spline is q + Δq / 8.
+        """
+        rows = []
+        for mask in self._masks_about_sample:
+            moments = [math.fsum(w * math.prod(map(pow, at, m)) for at, w in mask) for m in QUADRATICS]
+            rows.append(tuple(own - (max(m) == 2) / 4 for own, m in zip(moments, QUADRATICS, strict=True)))
+        return tuple(rows)
+
+    @property
+    def _masks_about_sample(self) -> Iterator[list[tuple[Steps, float]]]:
+        """The same masks: weights of samples by their steps from the one in the middle; some come more than once."""
+        if not self.octahedral:
+            places = [(x - 1, y - 1, z - 1) for x, y, z in product(range(self.size), repeat=3)]
+            yield from (list(zip(places, mask, strict=True)) for mask in self.masks_of_cube)
+            return
+        sides = [(x, y, z) for x, y, z in product((-1, 1), repeat=3)]
+        for terms in self.masks_of_octahedra:
+            yield [
+                (_half_way(centre, side), weight * math.prod(map(pow, side, unit)))
+                for centre, unit, weight in terms
+                for side in sides
+            ]
 
     @property
     def around(self) -> int:
@@ -301,6 +313,25 @@ def reads_more(stencil: LoweredStencil) -> bool:
     return any(not taps <= first for taps in others)
 
 
+def _outermost(masks: Sequence[Sequence[float]]) -> list[int]:
+    """Numbers of those that are not halfway between two others."""
+    rows = np.array(masks)
+    numbers = {row.tobytes(): i for i, row in enumerate(_told_apart(2 * rows))}
+    sums = (_told_apart(rows[:i] + rows[i]) for i in range(len(rows)))
+    halfway = {numbers.get(row.tobytes()) for own in sums for row in own}
+    return [i for i in range(len(rows)) if i not in halfway]
+
+
+def _told_apart(rows: np.ndarray) -> np.ndarray:
+    """As integers: what rounding alone has apart is equal, but for few."""
+    return np.rint(rows * 2.0**30).astype(np.int64)
+
+
+def _half_way(a: Steps, b: Steps) -> Steps:
+    x, y, z = ((i + j) // 2 for i, j in zip(a, b, strict=True))
+    return x, y, z
+
+
 def _exchange(along: Steps, axes: tuple[int, int]) -> Steps:
     own, (i, j) = list(along), axes
     own[i], own[j] = own[j], own[i]
@@ -369,6 +400,36 @@ def at_centre(arithmetic: Arithmetic, block: Block) -> Rows:
         rows[unit] = arithmetic.subtract(ends[1], ends[0])
         total = arithmetic.add(ends[0], ends[1]) if total is None else total
     return {(0, 0, 0): total, **rows}
+
+
+def trend_of(arithmetic: Arithmetic, at: Callable[[Steps], Value]) -> Rows:
+    """Coefficients of `QUADRATICS` of t, which is near the spline in the cube about a sample: t = q + Δq / 8.
+
+    q is the quadratic with the sample's value and the central differences of those around it.
+
+    Args:
+        at: samples by their steps from the one in the middle.
+    """
+    e = arithmetic
+    number = middle = at((0, 0, 0))
+    rows: Rows = {}
+    for unit in UNITS:
+        ahead, behind = at(unit), at(_moved_by(unit, unit, -2))
+        rows[unit] = e.multiply(e.subtract(ahead, behind), e.constant(0.5))
+        rows[_moved_by(unit, unit)] = bend = e.subtract(e.multiply(e.add(ahead, behind), e.constant(0.5)), middle)
+        number = e.multiply_add(bend, e.constant(0.25), number)
+    for first, second in combinations(UNITS, 2):
+        corners = [
+            at(_moved_by(_moved_by((0, 0, 0), first, i), second, j)) for i, j in ((1, 1), (-1, -1), (1, -1), (-1, 1))
+        ]
+        alike, apart = e.add(*corners[:2]), e.add(*corners[2:])
+        rows[_moved_by(first, second)] = e.multiply(e.subtract(alike, apart), e.constant(0.25))
+    return {(0, 0, 0): number, **rows}
+
+
+def _moved_by(at: Steps, by: Steps, times: int = 1) -> Steps:
+    x, y, z = (i + times * j for i, j in zip(at, by, strict=True))
+    return x, y, z
 
 
 class Sum:

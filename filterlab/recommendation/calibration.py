@@ -44,8 +44,13 @@ CALIBRATION: Mapping[str, tuple[tuple[float, ...], tuple[float, ...], tuple[floa
 }
 """Of values, gradients and second derivatives along lines: c, C and L at each of `FALLS`."""
 
+SURFACE: Mapping[str, tuple[float, float, float]] = {"value": (1.33, 1.26, 1.0), "gradient": (1.56, 1.32, 1.0)}
+"""By what c, C and L are multiplied where errors are those on a surface: it is a smaller part of a volume, and where it
+is an edge, the estimates of the signal are off to the same side all along it."""
+
 
 @lru_cache(maxsize=1024)
-def factors(quantity: str, fall: float) -> tuple[float, ...]:
+def factors(quantity: str, fall: float, on_surface: bool = False) -> tuple[float, ...]:
     """(c, C, L) at φ."""
-    return tuple(float(np.interp(fall, FALLS, known)) for known in CALIBRATION[quantity])
+    found = (float(np.interp(fall, FALLS, known)) for known in CALIBRATION[quantity])
+    return tuple(f * g for f, g in zip(found, SURFACE[quantity] if on_surface else (1.0, 1.0, 1.0), strict=True))

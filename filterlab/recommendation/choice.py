@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -61,7 +61,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Question:
-    """What `recommend` is asked, as its arguments; `boundary` by name."""
+    """What `recommend` is asked, as its arguments; `boundary` by name; level None: of no surface in particular."""
 
     task: str
     max_error: float
@@ -69,6 +69,7 @@ class Question:
     max_time: float
     boundary: str
     nan: str
+    level: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         for name in ("max_error", "max_memory", "max_time"):
@@ -76,6 +77,8 @@ class Question:
                 raise ValueError(f"{name} must be positive; got {getattr(self, name)!r}")
         if self.task not in TASKS:
             raise ValueError(f"task must be one of {', '.join(TASKS)}; got {self.task!r}")
+        if self.level is not None and self.task != "isosurface":
+            raise ValueError(f"level is that of an isosurface; got level={self.level:g} for task {self.task!r}")
 
     def fits(self, candidate: Candidate) -> bool:
         """Whether it most likely stays within the budget, and within the limits."""
@@ -127,6 +130,7 @@ def recommend(
     max_error: float,
     *,
     task: str = "resample",
+    level: float | None = None,
     max_memory: float = math.inf,
     max_time: float = math.inf,
     boundary: str | Boundary = Boundary.MIRROR,
@@ -154,6 +158,9 @@ def recommend(
     draw 500 of 505 picks kept their budgets. Where nothing was picked though an interval holds the budget, the answer
     is `undecided`; else nothing met it in 99.7 %.
 
+    Of a `level` errors are those on its surface, by area: in pictures of 249 volumes 97.5 % of 475 picks that were
+    asked so kept their budgets, where 88.3 % of those did that were asked of the volume.
+
     A picture sees a part of the region, where errors may be larger, as on an edge, or smaller, as in what is nearly
     even: in pictures of 461 volumes 95.2 % of picks for dvr and 93.3 % of those for isosurfaces kept their budgets, and
     nothing met the budget after 96.5 and 93.5 % of refusals that were not undecided (`docs/recommend.md`). The loss of
@@ -165,6 +172,7 @@ def recommend(
         max_error: the budget, as a fraction: 0.005 is half a percent.
         task: resample (as many samples as there are voxels), dvr (a picture of 512² pixels) or isosurface (value and
             gradient at as many points as there are voxels).
+        level: of the isosurface that is shown, a value of the volume; None: errors are those of all of the region.
         max_memory: bytes that the coefficients may take.
         max_time: seconds that prefiltering and doing the task once may take.
         boundary, nan: as for `filterlab.reconstruct`.
@@ -173,20 +181,20 @@ def recommend(
         seed: of the points; the errors found repeat themselves, the costs do not.
         progress: told what is done.
 
-    Every voxel is looked at once. Beyond that, work and memory are bounded: errors are found at 2¹⁴ points, drawn where
-    the volume has detail, of the whole volume up to 160³ voxels, else of 24 parts of it; costs on a part of at most
-    160³. What is recommended is built once, to see that it can be.
+    Every voxel is looked at once, and once more for a level. Beyond that, work and memory are bounded: errors are found
+    at 2¹⁴ points, drawn where the volume has detail, of the whole volume up to 160³ voxels, else of 24 parts of it;
+    costs on a part of at most 160³. What is recommended is built once, to see that it can be.
 
     Raises:
-        ValueError: a budget that is not positive, an unknown task or method, no finite voxels, or values so large that
-            float32 overflows.
+        ValueError: a budget that is not positive, an unknown task or method, a level for another task, or one that has
+            no surface in the region, no finite voxels, or values so large that float32 overflows.
     """
     volume, boundary = as_volume(volume), Boundary.named(boundary)
-    question, names = Question(task, max_error, max_memory, max_time, str(boundary), nan), _known(methods)
+    question, names = Question(task, max_error, max_memory, max_time, str(boundary), nan, level=level), _known(methods)
     samples, unknown = resolved(volume.samples.detach(), nan)
     samples = samples.reshape(-1, *samples.shape[-3:])
     unknown = None if unknown is None else unknown.reshape(samples.shape).cpu()
-    yardstick = Yardstick.of(samples.cpu(), unknown, boundary, seed, lambda done: progress(0.3 * done, "errors"))
+    yardstick = Yardstick.of(samples.cpu(), unknown, boundary, seed, lambda done: progress(0.3 * done, "errors"), level)
     errors = errors_of(yardstick, names, samples.dtype, lambda e: yardstick.estimate(task, e).likely <= max_error)
     progress(0.5, "costs")
     order, tick = 0 if task == "resample" else 1, lambda done: progress(0.5 + 0.5 * done, "costs")

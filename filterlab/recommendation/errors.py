@@ -2,7 +2,7 @@
 
 Letters: f the signal, r the reference (a spline of degree 7 that needs no boundary), r₃ the same of degree 3, f_M the
 field of a method under the boundary asked for, in the arithmetic that is used; ‖·‖ a root mean square over the region,
-in parts of the range of the samples.
+in parts of the range of the samples. Of a level the region is its surface in r, by area.
 
     d = ‖f_M − r‖   measured: kernel, prefilter, boundary, storage and rounding are all in it
     u = ‖r − r₃‖    the doubt: what two splines make of the same samples
@@ -17,7 +17,7 @@ where the spectrum falls steeply, and several times u where it does not: `calibr
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -34,6 +34,7 @@ from filterlab.volume import Boundary
 _DEGREES = (7, 3)
 _RESOLVED, _ROUNDING = 10.0, 1e-6  # decibels; about what float32 leaves of a range
 SURE = 2.5  # standard errors that the mean over points may be off by
+_LAYER, _MOVES = 0.5, 2  # voxels on either side of a surface, from which points are moved onto it; how often
 _SEGMENT, BANDS = 32, 8  # samples of a line whose spectrum is taken; parts of the band up to the Nyquist frequency
 _STEEPEST = 60.0  # decibels
 _INTEGERS = tuple(name for name, dtype in STORAGE.items() if not dtype.is_floating_point)
@@ -65,9 +66,11 @@ class Distance:
     rms: float
     spread: float = 0.0
 
-    def between(self, quantity: str, doubt: float, fall: float, rounding: float = 0.0) -> tuple[float, float, float]:
+    def between(
+        self, quantity: str, doubt: float, fall: float, rounding: float = 0.0, on_surface: bool = False
+    ) -> tuple[float, float, float]:
         """(low, high, likely) of the true error that has this distance from the reference."""
-        least, most, likely = factors(quantity, fall)
+        least, most, likely = factors(quantity, fall, on_surface)
         sampled = 1 + SURE * self.spread
         low = max(self.rms / sampled - least * doubt - rounding, 0.0)
         high, most_likely = (math.hypot(self.rms * sampled, factor * doubt, rounding) for factor in (most, likely))
@@ -93,6 +96,7 @@ class Yardstick:
     Attributes:
         boundary: of the fields.
         value_range: the least and the largest sample.
+        level: of the surface on which errors are looked at; None: in all of the region.
         patches, truth: parts of the volume, and (value, gradient) of the reference at their points.
         doubts: u of "value", "gradient" and "bend", the second derivative along lines.
         rounding: of the samples, by their floating type, RMS at most.
@@ -102,6 +106,7 @@ class Yardstick:
 
     boundary: Boundary
     value_range: tuple[float, float]
+    level: float | None
     patches: tuple[Patch, ...]
     truth: tuple[tuple[Tensor, Tensor], ...]
     doubts: Mapping[str, float]
@@ -127,15 +132,18 @@ class Yardstick:
         boundary: Boundary,
         seed: int = 0,
         tick: Callable[[float], None] = lambda done: None,
+        level: float | None = None,
     ) -> Yardstick:
-        """From samples (V, D, H, W), and the mask of those without a value.
+        """From samples (V, D, H, W), and the mask of those without a value; of a level, on its surface alone.
 
         Raises:
-            ValueError: no samples, or samples that overflow when fields are evaluated.
+            ValueError: no samples, samples that overflow when fields are evaluated, or a level without a surface.
         """
         value_range = _range(samples)
-        patches = tuple(patches_of(samples, unknown, boundary, SobolEngine(4, scramble=True, seed=seed)))
-        bare = cls(boundary, value_range, patches, (), {}, 0.0, 0.0, 0.0)
+        patches = tuple(patches_of(samples, unknown, boundary, SobolEngine(4, scramble=True, seed=seed), level))
+        bare = cls(boundary, value_range, level, (), (), {}, 0.0, 0.0, 0.0)
+        if level is not None:
+            patches = _of_area(level, [bare._on_surface(patch, level) for patch in patches], value_range)
         truth, sums, bands = [], torch.zeros(4, dtype=torch.float64), torch.zeros(BANDS, dtype=torch.float64)
         for i, patch in enumerate(patches):
             fine, coarse = (bare._jet(patch, degree) for degree in _DEGREES)
@@ -147,13 +155,33 @@ class Yardstick:
         *doubts, bend = sums.sqrt().tolist()
         named = dict(zip(("value", "gradient", "bend"), doubts, strict=True))
         rounding = _rounding_of(samples.dtype) * max(map(abs, value_range)) / bare.span
-        return replace(bare, truth=tuple(truth), doubts=named, rounding=rounding, bend=bend, fall=fall_of(bands))
+        found = {"doubts": named, "rounding": rounding, "bend": bend, "fall": fall_of(bands)}
+        return replace(bare, patches=patches, truth=tuple(truth), **found)
 
     def _jet(self, patch: Patch, degree: int) -> tuple[Tensor, Tensor, Tensor]:
         """Value (P, 1), gradient (P, 3), Hessian (P, 3, 3) of the reference, in parts of the range."""
         spline = endless_spline(self._scaled(patch.samples), degree)
         value, gradient, hessian = spline.jet(patch.points.double() + patch.shift, 2)
         return value[:, None], gradient, hessian
+
+    def _on_surface(self, patch: Patch, level: float) -> Patch:
+        """The points that are near to where the reference is the level, moved there, along the gradient.
+
+        The layer that they were drawn in is as thick everywhere, by the first order: their weights are those of area.
+        """
+        ends = torch.tensor(patch.samples.shape[::-1], dtype=torch.float64) - 1
+        spline, own = (
+            endless_spline(self._scaled(patch.samples), _DEGREES[0]),
+            (level - self.value_range[0]) / self.span,
+        )
+        at, weights = patch.points.double() + patch.shift, patch.weights
+        for _ in range(_MOVES):
+            value, gradient = spline.value_and_gradient(at)
+            off, slope = value - own, gradient.norm(dim=-1)
+            near = (off.abs() <= _LAYER * slope) & (slope > 0)
+            moved = at[near] - (off / slope.square())[near, None] * gradient[near]
+            at, weights = torch.minimum(moved.clamp_min(0), ends), weights[near]
+        return replace(patch, points=(at - patch.shift).float(), weights=weights)
 
     def _scaled(self, x: Tensor) -> Tensor:
         """In parts of the range, float64: nothing under- or overflows when it is squared."""
@@ -187,7 +215,8 @@ class Yardstick:
         """What the task counts, with what a march loses by a step."""
         parts = {"value": errors.value} if task == "resample" else {"value": errors.value, "gradient": errors.gradient}
         known = {"value": self.rounding, "gradient": 0.0}  # what is rounded alike has no gradient; what is not is in u
-        ends = [d.between(name, self.doubts[name], self.fall, known[name]) for name, d in parts.items()]
+        on_surface = self.level is not None
+        ends = [d.between(name, self.doubts[name], self.fall, known[name], on_surface) for name, d in parts.items()]
         lost = 0.0 if step is None else step**2 / 24
         bent = Distance(self.bend).between("bend", self.doubts["bend"], self.fall)
         return ErrorEstimate(
@@ -229,6 +258,18 @@ def _distance(squares: list[Tensor]) -> Distance:
         return Distance(0.0 if total == 0 else math.inf)
     spread = float(draws.std()) * math.sqrt(len(draws)) / total if len(draws) > 1 else 0.0  # of the mean square
     return Distance(math.sqrt(total), 0.5 * spread)
+
+
+def _of_area(level: float, patches: Sequence[Patch], value_range: tuple[float, float]) -> tuple[Patch, ...]:
+    """Those that have points on a surface, with weights that add up to 1. Raises ValueError where none has."""
+    total = math.fsum(float(patch.weights.sum()) for patch in patches)
+    if not total > 0:
+        low, high = value_range
+        raise ValueError(
+            f"expected a level with a surface in the inner part of the volume, whose samples are {low:.6g} … "
+            f"{high:.6g}; got {level:.6g}"
+        )
+    return tuple(replace(patch, weights=patch.weights / total) for patch in patches if len(patch.points))
 
 
 def _along_lines(hessian: Tensor) -> Tensor:

@@ -34,7 +34,8 @@ def sentences(found: Recommendation) -> list[str]:
     """What is counted, and what is recommended; or why nothing is, and the most accurate there is."""
     low, high = found.value_range
     counted = f"{COUNTED[found.task]}, in parts of the range {low:.6g} … {high:.6g}"
-    lines = [f"Error: {counted}; inner {INNER} of the volume."]
+    where = "" if found.level is None else f", next to the surface of {found.level:g}"
+    lines = [f"Error: {counted}; inner {INNER} of the volume{where}."]
     chosen = found.chosen
     if found.pick is not None:
         lines.append(f"Recommended: {_named(chosen)}, {_interval(chosen)} for a budget of {percent(found.max_error)}.")
@@ -51,7 +52,7 @@ def sentences(found: Recommendation) -> list[str]:
 def _help(found: Recommendation) -> str:
     """Which budget would be met, and what to change for a smaller one."""
     ways = [f"a budget of {_percent_above(found.best.error.likely)}, which that one most likely keeps"]
-    if found.task != "resample" and found.of_value.likely <= found.max_error:
+    if found.task != "resample" and found.level is None and found.of_value.likely <= found.max_error:
         ways.append(
             "to count the value alone, as task resample does: the gradient is what is off, the value is likely within "
             f"{_percent_above(found.of_value.likely)}"
@@ -174,6 +175,7 @@ def data(found: Recommendation) -> dict[str, Any]:
 
     return {
         "task": found.task,
+        "level": found.level,
         "max_error": found.max_error,
         "max_memory": found.max_memory if math.isfinite(found.max_memory) else None,
         "max_time": found.max_time if math.isfinite(found.max_time) else None,

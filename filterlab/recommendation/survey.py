@@ -9,6 +9,8 @@ A brick that holds all of the detail gets most of the points, however small it i
 share by volume all the same. Points come from a scrambled Sobol sequence in four dimensions, one along the running sum
 of p_b and three within a brick: their means are as unbiased as those of random points, and spread less.
 
+Of a level only bricks count whose samples, or those next to them, lie on both sides of it.
+
 A volume of up to 160³ voxels is one patch. Of a larger one 24 patches of 16³ voxels are drawn in the same way, and cut
 out with 24 voxels around them, over which what a prefilter carries from the cut falls below 10⁻¹³.
 """
@@ -73,9 +75,18 @@ class Patch:
     coarser: float
 
 
-def patches_of(samples: Tensor, unknown: Tensor | None, boundary: Boundary, random: SobolEngine) -> list[Patch]:
-    """Of samples (V, D, H, W), and a mask of the same shape of those that have no value; None: all have."""
+def patches_of(
+    samples: Tensor, unknown: Tensor | None, boundary: Boundary, random: SobolEngine, level: float | None = None
+) -> list[Patch]:
+    """Of samples (V, D, H, W), and a mask of the same shape of those that have no value; None: all have.
+
+    With a level, of bricks that may hold it alone; none: there are none.
+    """
     volume = torch.stack([_volume_of_bricks(samples.shape[1:])] * len(samples))  # (V, bd, bh, bw), in parts of 1
+    if level is not None:
+        volume = volume * torch.stack([_may_hold(level, one, boundary) for one in samples])
+        if not bool(volume.any()):
+            return []
     share = _share(volume / len(samples), samples, boundary)
     if samples.numel() <= WHOLE and len(samples) <= _WHOLE_VOLUMES:
         unit = random.draw(POINTS, dtype=torch.float64)
@@ -96,6 +107,24 @@ def _volume_of_bricks(size: Size) -> Tensor:
         length = high_end - low_end
         parts.append(length / length.sum() if n > 1 else torch.ones(1, dtype=torch.float64))
     return parts[0][:, None, None] * parts[1][:, None] * parts[2]
+
+
+def _may_hold(level: float, one: Tensor, boundary: Boundary) -> Tensor:
+    """(bd, bh, bw): bricks of (D, H, W) whose samples, with one more on every side, lie on both sides of a level."""
+    planes = _planes(one)
+    slabs = (_slab(one, start, planes, boundary)[1:-1] for start in range(0, one.shape[0], planes))
+    return torch.cat([_straddling(level, slab, boundary) for slab in slabs])
+
+
+def _straddling(level: float, slab: Tensor, boundary: Boundary) -> Tensor:
+    """Of a slab with one plane more on both sides."""
+    wide = boundary.extend(boundary.extend(slab.double(), 1, 1, 1), 2, 1, 1)
+    rest = [end for n in reversed(wide.shape) for end in (0, (2 - n) % _BRICK)]
+    most, negated = (
+        functional.max_pool3d(functional.pad(own, rest, value=-math.inf)[None], _BRICK + 2, _BRICK)[0]
+        for own in (wide, -wide)
+    )
+    return (most >= level) & (-negated <= level)
 
 
 def _ends_of_bricks(n: int, low: float, high: float) -> tuple[Tensor, Tensor]:
@@ -121,7 +150,7 @@ def _activities(samples: Tensor, boundary: Boundary) -> tuple[Tensor, Tensor]:
     One pass over all voxels, in slabs.
     """
     low, high = (float(end) for end in samples.aminmax())
-    planes = max(1, _SLAB // (samples[0, 0].numel() * _BRICK)) * _BRICK
+    planes = _planes(samples[0])
     found: tuple[list[Tensor], list[Tensor]] = ([], [])
     for one in samples:
         rows: tuple[list[Tensor], list[Tensor]] = ([], [])
@@ -132,6 +161,11 @@ def _activities(samples: Tensor, boundary: Boundary) -> tuple[Tensor, Tensor]:
         for kept, row in zip(found, rows, strict=True):
             kept.append(torch.cat(row))
     return torch.stack(found[0]), torch.stack(found[1])
+
+
+def _planes(one: Tensor) -> int:
+    """Of (D, H, W), that are looked at at a time: whole bricks."""
+    return max(1, _SLAB // (one[0].numel() * _BRICK)) * _BRICK
 
 
 def _slab(one: Tensor, start: int, planes: int, boundary: Boundary) -> Tensor:

@@ -258,7 +258,8 @@ def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]
     method = scene.method
     if volume is None or method is None or method.max_error is None:
         return scene, ()
-    found = recommend(volume, method.max_error, task="dvr", boundary=method.boundary, nan=method.nan)
+    use = _use(scene, volume)
+    found = recommend(volume, method.max_error, **use, boundary=method.boundary, nan=method.nan)
     if found.pick is None:
         told = " ".join(report.sentences(found)[2:]).removeprefix("The ").removesuffix(".")
         raise ValueError(f"method: found none within max_error {report.percent(method.max_error)}; the {told}")
@@ -271,6 +272,13 @@ def settled(scene: Scene, volume: Volume | None) -> tuple[Scene, tuple[str, ...]
     )
     step = found.pick.step if scene.stepped and scene.step is None else scene.step
     return scene.model_copy(update={"method": explicit, "step": step}), tuple(report.sentences(found))
+
+
+def _use(scene: Scene, volume: Volume) -> dict[str, Any]:
+    """What the scene shows of the volume, as `recommend` is asked: a surface, values, or all that rays go through."""
+    if isinstance(scene.surface, LevelSetModel):
+        return {"task": "isosurface", "level": scene.surface.at(partial(_range, volume.samples))}
+    return {"task": "dvr" if scene.slice is None else "resample"}
 
 
 def _volume(scene: Scene, loaded: Volume | None) -> Volume | None:

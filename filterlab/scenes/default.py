@@ -60,13 +60,13 @@ def default_view(volume: str | os.PathLike[str], overrides: Mapping[str, str] | 
     return scene, samples
 
 
-def suggested(field: Field, size: tuple[int, int] = _SIZE) -> dict[str, Any]:
-    """All of a scene but its volume and method, for a field and an image of (width, height)."""
+def suggested(field: Field, size: tuple[int, int] = _SIZE, level: float | None = None) -> dict[str, Any]:
+    """All of a scene but its volume and method, for a field, an image of (width, height), a level to show."""
     samples, direction = sampled(field), direction_for(field)
     transfer = TransferFunction.suggested(field, samples)
     camera = PerspectiveCamera.suggested(field, transfer, direction, aspect=size[0] / size[1], samples=samples)
     return {
-        "transfer": {"unit": transfer.unit, "points": _points(transfer)},
+        **(_medium(transfer) if level is None else {"surface": level}),
         "camera": {
             "position": _rounded(camera.position),
             "target": _rounded(camera.target),
@@ -82,10 +82,17 @@ def suggested(field: Field, size: tuple[int, int] = _SIZE) -> dict[str, Any]:
             "shininess": 24.0,
         },
         "size": list(size),
+        "background": [0.02, 0.022, 0.03],
+    }
+
+
+def _medium(transfer: TransferFunction) -> dict[str, Any]:
+    """How it is marched through."""
+    return {
+        "transfer": {"unit": transfer.unit, "points": _points(transfer)},
         "step": STEP,
         "jitter": 1,
         "termination": 0.002,
-        "background": [0.02, 0.022, 0.03],
     }
 
 

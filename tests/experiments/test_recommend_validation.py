@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.recommend_validation import HALVES, Truth, fitted, judged
+from experiments.recommend_validation import HALVES, Truth, fitted, fitted_on_surfaces, judged
 from experiments.report.recommend_validation import BARS, _met, _verdict, outcomes, pictured
 from filterlab.recommendation import Candidate, ErrorEstimate, Recommendation
-from filterlab.recommendation.calibration import CALIBRATION, FALLS
+from filterlab.recommendation.calibration import CALIBRATION, FALLS, factors
 
 
 def candidate(method: str, seconds: float, low: float, high: float) -> Candidate:
@@ -102,6 +102,19 @@ def test_factors_are_those_with_which_intervals_would_just_have_held() -> None:
         assert least[6] == pytest.approx(0.97 * 2, rel=0.01)
         assert least[3] == most[6] == pytest.approx(0, abs=1e-6)
         assert least[0] == math.inf  # nothing near
+
+
+def test_factors_on_a_surface_are_in_parts_of_those_of_a_volume() -> None:
+    c, most, likely = factors("value", FALLS[4])
+    whole = record(FALLS[3], 0.2, [[1.0, 0.0, 1.0]])
+    assert fitted_on_surfaces([whole]) == {"value": [math.inf] * 3, "gradient": [math.inf] * 3}
+    surface, = record(FALLS[4], 0.2, [[1.0, 0.0, math.hypot(1, 1.7 * most * 0.2)]])["boundaries"]  # fmt: skip
+    below, = record(FALLS[4], 0.2, [[1.0, 0.0, 1 - 0.5 * c * 0.2]])["boundaries"]  # fmt: skip
+    whole["boundaries"][0]["aimed"] = surface
+    assert fitted([whole])["value"][1][3] == 0
+    assert fitted_on_surfaces([whole])["value"] == pytest.approx([0.0, 1.7, 1.7 * most / likely])
+    whole["boundaries"][0]["aimed"] = below
+    assert fitted_on_surfaces([whole])["value"] == pytest.approx([0.5, 0.0, 0.0])
 
 
 def test_factors_are_not_fitted_to_what_reports() -> None:

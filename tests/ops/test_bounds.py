@@ -15,7 +15,7 @@ from filterlab.fields import ranges
 from filterlab.kernels import KERNELS, LINEAR, TensorKernel
 from filterlab.methods import from_kernel
 from filterlab.ops import cpu
-from filterlab.ops.bounds import CODES, Codes
+from filterlab.ops.bounds import CODES, Codes, of_pairs, tells_off_trend
 from filterlab.ops.differentiable import bounds as bounds_of
 from filterlab.ops.pieces import Lattice
 from filterlab.ops.tetrahedra import AnyLattice
@@ -40,6 +40,16 @@ def assert_alike(lattice: AnyLattice) -> None:
             assert int(difference.max()) <= 1
             assert float((difference > 0).double().mean()) < 1e-3
         assert len(fused.high.unique()) > 20
+        assert_off_alike(plain.off_trend, fused.off_trend, tells_off_trend(lattice))
+
+
+def assert_off_alike(plain: Tensor | None, fused: Tensor | None, told: bool) -> None:
+    """But for the last bit of a bfloat16."""
+    assert (plain is not None) is (fused is not None) is told
+    if plain is not None and fused is not None:
+        assert plain.shape == fused.shape
+        for a, b in zip(of_pairs(plain), of_pairs(fused), strict=True):
+            assert torch.allclose(a, b, rtol=2.0**-7, atol=1e-12)
 
 
 WITHOUT_LLVMLITE = """
@@ -91,6 +101,8 @@ def test_what_is_not_finite_may_be_anything(method, cells):
     plain, fused = (bounds_of.bounds(lattice, 1, codes, way) for way in ("reference", "cpu"))
     unknown = (fused.low == -CODES // 2) & (fused.high == CODES // 2 - 1)
     assert cells <= int(unknown.sum()) <= 2 * cells
+    if fused.off_trend is not None:
+        assert all(bool((own[unknown].isinf()).all()) for own in of_pairs(fused.off_trend))
     assert torch.equal(fused.low[~unknown], plain.low[~unknown])
     assert torch.equal(fused.high[~unknown], plain.high[~unknown])
     assert all(math.isfinite(x) for x in fused.ends)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filterlab.ops.bounds import Bounds, Codes
+from filterlab.ops.bounds import Bounds, Codes, of_pairs, tells_off_trend
 from filterlab.ops.cpu import compiler
 from filterlab.ops.cpu import threads as pool
 from filterlab.ops.cpu.block_bits import BlockBitsJob, BlockBitsVariant
@@ -27,18 +27,20 @@ def bounds(lattice: AnyLattice, edge: int, codes: Codes) -> Bounds:
     """`ops.reference.bounds.bounds`, fused."""
     coefficients, depth = in_whole_rows(lattice.coefficients), lattice.cells[2]
     step = depth if edge == 1 else _LAYERS
-    parts = [_of_layers(lattice, coefficients[z:], codes, min(step, depth - z)) for z in range(0, depth, step)]
-    lows, highs, ends = zip(*parts, strict=True)
+    layers = [_of_layers(lattice, coefficients[z:], codes, min(step, depth - z)) for z in range(0, depth, step)]
+    lows, highs, ends, off = zip(*layers, strict=True)
     low, high = (
-        torch.from_numpy(np.concatenate([_joined(x, edge, least) for x in own]))
+        np.concatenate([_joined(x, edge, least) for x in own])
         for own, least in ((lows, np.minimum), (highs, np.maximum))
     )
-    return Bounds(low, high, (min(e[0] for e in ends), max(e[1] for e in ends)))
+    ends = min(e[0] for e in ends), max(e[1] for e in ends)
+    off_trend = torch.from_numpy(np.concatenate([_joined_pairs(x, edge) for x in off])) if off[0] is not None else None
+    return Bounds(torch.from_numpy(low), torch.from_numpy(high), ends, off_trend)
 
 
 def _of_layers(
     lattice: AnyLattice, coefficients: Tensor, codes: Codes, depth: int
-) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float], np.ndarray | None]:
     """Of single cells, whose first taps are the first of the coefficients."""
     plane, row, _ = coefficients.stride()
     width, height, _ = lattice.cells
@@ -50,16 +52,19 @@ def _of_layers(
         cells_y=height,
         factor=lattice.scale / codes.step,
         offset=(lattice.shift - codes.start) / codes.step,
+        scale=lattice.scale,
         next=0,
         chunks=depth,
     )
     low, high = (np.empty((depth, height, width), np.int16) for _ in range(2))
+    off_trend = np.empty(low.shape, np.int32) if tells_off_trend(lattice) else None
     ends = np.empty((2, depth, lanes))
-    job.point(coefficients=coefficients, low=low, high=high, least=ends[0], most=ends[1])
+    arrays = {} if off_trend is None else {"off_trend": off_trend}
+    job.point(coefficients=coefficients, low=low, high=high, least=ends[0], most=ends[1], **arrays)
     function = compiler.compiled(_variant(lattice, coefficients, lanes))
     pool.run(function, [job] * max(1, min(torch.get_num_threads(), depth)))
     least, most = sorted(lattice.scale * float(x) + lattice.shift for x in (ends[0].min(), ends[1].max()))
-    return low, high, (least, most)
+    return low, high, (least, most), off_trend
 
 
 def _variant(lattice: AnyLattice, coefficients: Tensor, lanes: int) -> HullsVariant:
@@ -76,6 +81,15 @@ def _joined(cells: np.ndarray, edge: int, least: np.ufunc) -> np.ndarray:
         least(joined[: len(second)], second, out=joined[: len(second)])
         cells = joined.swapaxes(0, axis)
     return cells
+
+
+def _joined_pairs(cells: np.ndarray, edge: int) -> np.ndarray:
+    """The same of `ops.bounds.in_pairs`, the least of the low ones and the greatest of the high ones."""
+    low, high = (
+        _joined(own.numpy(), edge, least)
+        for own, least in zip(of_pairs(torch.from_numpy(cells)), (np.minimum, np.maximum), strict=True)
+    )
+    return (low.view(np.int32) >> 16 & 0xFFFF) | high.view(np.int32)
 
 
 def bits_of_blocks(low: Tensor, high: Tensor, least: Tensor, most: Tensor, below: int, above: int) -> Tensor:

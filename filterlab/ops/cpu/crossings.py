@@ -6,7 +6,7 @@ together for longer, and take a tenth less time than P of one row (Marschner-Lob
 For a pack of P rays, until all have ended:
 
     walk        every ray to its next cell that may hold the level (`ops.cpu.cells`); of splines on tetrahedra every one
-                that does, of which a quadratic near the spline leaves over one in four
+                that does, of which a quadratic near the spline leaves over one in three
     restrict    the sum over taps on the ray's part in that cell, P at a time (`ops.cpu.restriction`)
     signs       one change of sign among the coefficients of f − level: there is the hit, the ray waits for the end
                 several: the part that holds the first root is looked for at once (`ops.cpu.polynomials`)
@@ -34,7 +34,7 @@ from filterlab.ops.cpu.piece_roots import EveryRoot, Signs, first_root
 from filterlab.ops.cpu.polynomials import FirstRoot, NextRoots, Part, Rows
 from filterlab.ops.cpu.restriction import Restriction, Section
 from filterlab.ops.cpu.taps import Grid
-from filterlab.ops.cpu.tetrahedral_restriction import Level, TetrahedralRestriction
+from filterlab.ops.cpu.tetrahedral_restriction import Level, OffTrend, TetrahedralRestriction
 from filterlab.ops.raycast import JUMP, PLACES_APART, REPEATED
 from filterlab.ops.tetrahedra import LoweredStencil, TetrahedralStencil
 
@@ -62,6 +62,7 @@ FIELDS: dict[str, type] = {
     "shift": ctypes.c_double,
     "margin": ctypes.c_double,  # that rounding may add to f − level
     "marks": ctypes.c_void_p,  # (bz, by, bx) 16 bits, see `ops.raycast.Raycast`
+    "off_trend": ctypes.c_void_p,  # (pz, py, px) 32 bits, of parts of half a brick's edge, of splines on tetrahedra
     **{f"bricks_{a}": ctypes.c_int64 for a in AXES},  # their number
     "edge": ctypes.c_int64,  # of a brick, log₂ of its cells
     "t": ctypes.c_void_p,  # (R) d, written: where the first hit is; (R, k) where sheets are
@@ -160,7 +161,9 @@ class _Program:
     def _restriction_of(self, stencil: LoweredStencil, grid: Grid) -> Restriction | TetrahedralRestriction:
         e, v = self.lanes, self.variant
         if isinstance(stencil, TetrahedralStencil):
-            return TetrahedralRestriction(e, stencil, self.storage, grid, v.room, self.level)
+            return TetrahedralRestriction(
+                e, stencil, self.storage, grid, v.room, self.level, OffTrend(self.places, self.job)
+            )
         return Restriction(e, stencil, v.degree, self.storage, grid, v.room)
 
     def _rays_of(self, pack: Value) -> list[Value]:

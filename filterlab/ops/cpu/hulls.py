@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from types import SimpleNamespace
@@ -18,11 +18,11 @@ import torch
 from llvmlite import ir
 
 from filterlab import bernstein
-from filterlab.ops.bounds import CODES
+from filterlab.ops.bounds import CODES, HALF_ROUNDING
 from filterlab.ops.cpu import frame, job
-from filterlab.ops.cpu.lanes import DOUBLE, I1, I16, I32, I64, STORAGE, Lanes, Value
+from filterlab.ops.cpu.lanes import DOUBLE, FLOAT, I1, I16, I32, I64, STORAGE, Lanes, Value
 from filterlab.ops.stencil import Lowered
-from filterlab.ops.tetrahedra import LoweredStencil, Steps, TetrahedralStencil, at_centre
+from filterlab.ops.tetrahedra import QUADRATICS, LoweredStencil, Steps, TetrahedralStencil, at_centre, trend_of
 
 # Arrays are contiguous; d is a double.
 FIELDS: dict[str, type] = {
@@ -36,6 +36,8 @@ FIELDS: dict[str, type] = {
     "offset": ctypes.c_double,
     "low": ctypes.c_void_p,  # (layers, cells_y, cells_x) 16 bits, written
     "high": ctypes.c_void_p,
+    "scale": ctypes.c_double,  # f is scale · sum and a number
+    "off_trend": ctypes.c_void_p,  # (layers, cells_y, cells_x) 32 bits, written: of splines, as in `ops.bounds.Bounds`
     "least": ctypes.c_void_p,  # (layers, P) d, written: of those of a layer that are finite
     "most": ctypes.c_void_p,
     "chunks": ctypes.c_int64,  # `next` stops here: layers
@@ -108,7 +110,7 @@ class _Program:
         self.low.value, self.high.value = e.constant(math.inf), e.constant(-math.inf)
         self.total.value = e.constant(0)
         self.bound(z, y, x)
-        self._write(b.add(b.mul(b.add(b.mul(z, j.cells_y), y), j.cells_x), x))
+        self.write_cells(b.add(b.mul(b.add(b.mul(z, j.cells_y), y), j.cells_x), x))
 
     def _load(self, index: Value) -> Value:
         e, storage = self.lanes, self.storage
@@ -127,9 +129,15 @@ class _Program:
                 value = own(value, c)
             variable.value = value
 
-    def _write(self, place: Value) -> None:
+    def _whole(self) -> Value:
+        """A mask of cells with nothing but finite coefficients."""
+        e = self.lanes
+        return self.builder.fcmp_ordered("<", e.absolute(self.total.value), e.constant(math.inf))
+
+    def write_cells(self, place: Value) -> None:
+        """What is told of a pack of cells, from the first one's place on."""
         e, b, j = self.lanes, self.builder, self.job
-        whole = b.fcmp_ordered("<", e.absolute(self.total.value), e.constant(math.inf))
+        whole = self._whole()
         low, high = self.low.value, self.high.value
         self.least.value = e.where(whole, e.minimum(low, self.least.value), self.least.value)
         self.most.value = e.where(whole, e.maximum(high, self.most.value), self.most.value)
@@ -212,18 +220,66 @@ class _OfCells(_Program):
         return found
 
 
-class _OfCubes(_Program):
-    """Of a spline on tetrahedra, with the same samples for all of a cube: every different mask, once."""
+class _OfSpline(_Program):
+    """Of a spline on tetrahedra: every different mask, once."""
+
+    def __init__(self, variant: HullsVariant, function: ir.Function) -> None:
+        super().__init__(variant, function)
+        assert isinstance(variant.stencil, TetrahedralStencil)
+        self.spline = variant.stencil.spline
+
+    def prepare(self) -> None:
+        e = self.lanes
+        self.off_low, self.off_high = e.variable(e.constant(0)), e.variable(e.constant(0))
 
     def bound(self, z: Value, y: Value, x: Value) -> None:
-        stencil = self.variant.stencil
-        assert isinstance(stencil, TetrahedralStencil)
-        samples = [self._sample(z, y, x, at) for at in product(range(stencil.spline.size), repeat=3)]
-        for mask in stencil.spline.masks_of_cube:
-            total = None
-            for weight, sample in zip(mask, samples, strict=True):
-                total = self._added(total, weight, sample)
+        e = self.lanes
+        self.off_low.value, self.off_high.value = e.constant(math.inf), e.constant(-math.inf)
+        at, sums = self.sums(z, y, x)
+        trend = trend_of(e, at)
+        for total, moments in zip(sums, self.spline.moments, strict=True):
+            off = total
+            for m, moment in zip(QUADRATICS, moments, strict=True):
+                off = self._added(off, -moment, trend[m])
             self._bound([total])
+            self.off_low.value = e.minimum(self.off_low.value, off)
+            self.off_high.value = e.maximum(self.off_high.value, off)
+
+    def sums(self, z: Value, y: Value, x: Value) -> tuple[Callable[[Steps], Value], Iterator[Value]]:
+        """Samples by steps from the one in the middle; all coefficients of a pack of cubes."""
+        raise NotImplementedError
+
+    def write_cells(self, place: Value) -> None:
+        super().write_cells(place)
+        e, b, j = self.lanes, self.builder, self.job
+        scale = e.everywhere(j.scale)
+        first, second = (e.multiply(x.value, scale) for x in (self.off_low, self.off_high))
+        low, high = self._half(e.minimum(first, second), -1), self._half(e.maximum(first, second), 1)
+        pairs = b.or_(b.lshr(low, e.integers_32(16)), b.and_(high, e.integers_32(-0x10000)))
+        e.store(pairs, e.advance(j.off_trend, place, I32))
+
+    def _half(self, value: Value, side: int) -> Value:
+        """Bits of floats whose upper half is a bfloat16 beyond a value; see `ops.bounds.in_pairs`."""
+        e, b = self.lanes, self.builder
+        wider = e.multiply_add(e.absolute(value), e.constant(side * HALF_ROUNDING), value)
+        number = b.fptrunc(e.where(self._whole(), wider, e.constant(side * math.inf)), ir.VectorType(FLOAT, e.count))
+        return b.add(b.bitcast(number, ir.VectorType(I32, e.count)), e.integers_32(0x8000))
+
+
+class _OfCubes(_OfSpline):
+    """With the same samples for all of a cube."""
+
+    def sums(self, z: Value, y: Value, x: Value) -> tuple[Callable[[Steps], Value], Iterator[Value]]:
+        samples = {at: self._sample(z, y, x, at) for at in product(range(self.spline.size), repeat=3)}
+
+        def every() -> Iterator[Value]:
+            for mask in self.spline.masks_of_cube:
+                total = None
+                for weight, sample in zip(mask, samples.values(), strict=True):
+                    total = self._added(total, weight, sample)
+                yield total
+
+        return lambda steps: samples[steps[0] + 1, steps[1] + 1, steps[2] + 1], every()
 
     def _sample(self, z: Value, y: Value, x: Value, at: Sequence[int]) -> Value:
         b, j = self.builder, self.job
@@ -231,18 +287,20 @@ class _OfCubes(_Program):
         return self._load(b.add(b.mul(row, j.width), b.add(x, I64(at[0]))))
 
 
-class _OfOctahedra(_Program):
-    """Of a spline on octahedra, two of which meet in a cube; along axes of odd indices cubes are turned round."""
+class _OfOctahedra(_OfSpline):
+    """On octahedra, two of which meet in a cube; along axes of odd indices cubes are turned round."""
 
-    def bound(self, z: Value, y: Value, x: Value) -> None:
-        stencil = self.variant.stencil
-        assert isinstance(stencil, TetrahedralStencil)
-        samples = _Samples(self, stencil.spline.around, (x, y, z))
-        for terms in stencil.spline.masks_of_octahedra:
-            total = None
-            for centre, unit, weight in terms:
-                total = self._added(total, weight, samples.of_centre(centre, unit))
-            self._bound([total])
+    def sums(self, z: Value, y: Value, x: Value) -> tuple[Callable[[Steps], Value], Iterator[Value]]:
+        samples = _Samples(self, self.spline.around, (x, y, z))
+
+        def every() -> Iterator[Value]:
+            for terms in self.spline.masks_of_octahedra:
+                total = None
+                for centre, unit, weight in terms:
+                    total = self._added(total, weight, samples.of_centre(centre, unit))
+                yield total
+
+        return samples.at, every()
 
 
 class _Samples:

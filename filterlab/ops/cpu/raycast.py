@@ -136,5 +136,7 @@ def _job(given: Raycast, coefficients: Tensor) -> RaycastJob:
         "upper": lattice.upper,
     }
     arrays = {name: torch.tensor(x, dtype=torch.float64) for name, x in numbers.items()}
+    if given.off_trend is not None:
+        arrays["off_trend"] = given.off_trend.contiguous()
     job.point(coefficients=coefficients, marks=given.marks.contiguous(), **arrays)
     return job

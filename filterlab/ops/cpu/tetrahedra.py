@@ -14,7 +14,7 @@ from llvmlite import ir
 
 from filterlab.ops.cpu.lanes import I32, I64, Lanes, Storage, Value
 from filterlab.ops.cpu.taps import Grid, Lines, Location
-from filterlab.ops.tetrahedra import Block, Steps, Sum, TetrahedralStencil, Turned
+from filterlab.ops.tetrahedra import Block, Rows, Sum, TetrahedralStencil, Turned, trend_of
 
 
 class CellLocation(Location):
@@ -99,21 +99,20 @@ class TetrahedralTaps:
         along = self.sum.along_cone(turned, strides)
         return Corners([self._moved(first, along, centre) for centre in spline.centres], same)
 
-    def around_sample(self, odd: Sequence[Value]) -> Corners:
-        """Around `Trend.centres`, from the coefficient of the first sample that a cube needs; masks along x, y, z."""
-        e, b, spline = self.lanes, self.builder, self.sum.spline
-        kind = ir.VectorType(I64, e.count)
+    def trend(self, taps: list[Value]) -> Rows:
+        """`trend_of` the samples around the one in the middle of every lane's cube.
 
-        def moved(centre: Steps) -> Value:
-            total = ir.Constant(kind, None)
-            for stride, mirrored, c in zip(self._strides(), odd, centre, strict=True):
-                steps = (ir.Constant(kind, [(side * c - 1) // 2] * e.count) for side in (1, -1))
-                ahead, behind = (b.mul(stride, step) for step in steps)  # the same of all rays: made before they are
-                total = b.add(total, b.select(mirrored, behind, ahead))
-            return total
-
-        same = self._diagonal(spline.around - spline.before)
-        return Corners([moved(centre) for centre in spline.trend.centres], same)
+        Args:
+            taps: address of every lane's first sample that its cube needs.
+        """
+        b, middle, found = self.builder, self.sum.spline.around, {}
+        plane = b.mul(self.grid.width, self.grid.height)
+        for k in (-1, 0, 1):
+            sides = {j: min(1, 2 - abs(j) - abs(k)) for j in (-1, 0, 1)}
+            needed = {middle + j: range(middle - side, middle + side + 1) for j, side in sides.items()}
+            for j, line in self.lines.fetch(taps, b.mul(plane, I64(middle + k)), needed):
+                found |= {(i - middle, j - middle, k): tap for i, tap in line.items()}
+        return trend_of(self.lanes, found.__getitem__)
 
     def _strides(self) -> list[Value]:
         plane = self.builder.mul(self.grid.width, self.grid.height)

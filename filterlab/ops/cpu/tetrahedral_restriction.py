@@ -1,9 +1,10 @@
 """Splines on tetrahedra along rays, a cube about a sample at a time: what `restriction` is for sums over taps.
 
-A cube is looked at first: how near a quadratic comes to the level along the ray, and whether the spline may be so much
-apart from it (`ops.tetrahedra.Trend`). Of four cubes that may hold the level three are left out so (Marschner-Lobb
-128³, level ½), and most tetrahedra of the others. In a cube that is left the parts of `ops.cubes` are met in order, one
-in each lane, until all lanes are through or need not go on:
+A cube is looked at first: how near its trend comes to the level along the ray, a quadratic made of 19 samples, and
+between what the spline is off that anywhere in the cube, which was found when the volume was bounded (`ops.bounds`).
+Of three cubes that may hold the level two are left out so (Marschner-Lobb 128³, level ½), and most tetrahedra of the
+others. In a cube that is left the parts of `ops.cubes` are met in order, one in each lane, until all lanes are through
+or need not go on:
 
     next plane ahead, behind which the level may be ─▶ the part's middle, turned ─▶ coefficients of its tetrahedron
       ─▶ the blossom at both ends
@@ -17,10 +18,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 from llvmlite import ir
 
-from filterlab.ops.cpu.lanes import I1, I64, Lanes, Storage, Value, Variable
+from filterlab.ops.cpu.lanes import FLOAT, I1, I32, I64, Lanes, Storage, Value, Variable
 from filterlab.ops.cpu.restriction import Section
 from filterlab.ops.cpu.taps import Grid
 from filterlab.ops.cpu.tetrahedra import TetrahedralTaps
@@ -37,49 +39,67 @@ class Level:
     margin: Value
 
 
+class OffTrend:
+    """Reads what is known of f − t in cubes (`ops.bounds`).
+
+    Args:
+        lanes: of packs of rays.
+        job: fields of `ops.cpu.crossings.FIELDS`.
+    """
+
+    def __init__(self, lanes: Lanes, job: SimpleNamespace) -> None:
+        self.lanes, self.builder, self.job = lanes, lanes.builder, job
+        b = lanes.builder
+        self._half = b.sub(job.edge, I64(1))  # log₂ of the cells along an edge of a part
+        last = b.sub(b.shl(I64(1), self._half), I64(1))
+        self._width, self._height = (b.lshr(b.add(n, last), self._half) for n in (job.cells_x, job.cells_y))
+
+    def read(self, cell: Sequence[Value]) -> tuple[Value, Value]:
+        """Packs of floats: the least and the greatest in every lane's cube."""
+        e, b = self.lanes, self.builder
+        half, width, height = (e.everywhere(b.trunc(n, I32)) for n in (self._half, self._width, self._height))
+        x, y, z = (b.lshr(own, half) for own in cell)
+        line, kind = b.add(b.mul(z, height), y), ir.VectorType(I32, e.count)
+        index, pairs = b.add(b.mul(e.widen(line), e.widen(width)), e.widen(x)), ir.Constant(kind, ir.Undefined)
+        for lane in range(e.count):
+            place = e.advance(self.job.off_trend, e.lane(index, lane), I32)
+            pairs = b.insert_element(pairs, b.load(place, typ=I32), I32(lane))
+        floats = ir.VectorType(FLOAT, e.count)
+        low, high = b.shl(pairs, e.integers_32(16)), b.and_(pairs, e.integers_32(-0x10000))
+        return b.bitcast(low, floats), b.bitcast(high, floats)
+
+
 class NearLevel:
-    """What is known of the spline on each lane's way in a cube: a quadratic, and how far it is from that at most.
+    """What is known of the spline on each lane's way in a cube: its trend, and between what it is off that.
 
     Make it before any loop.
     """
 
     def __init__(self, lanes: Lanes, level: Level) -> None:
         self.lanes, self.builder, self.level = lanes, lanes.builder, level
-        self._rows = [lanes.variable(lanes.constant(0)) for _ in range(3)]
-        self._apart = lanes.variable(lanes.constant(0))
+        self._powers = [lanes.variable(lanes.constant(0)) for _ in range(3)]
+        self._low, self._high = (lanes.variable(lanes.constant(0)) for _ in range(2))
 
-    def keep(self, mask: Value, rows: Sequence[Value], apart: Value) -> None:
-        """For lanes under the mask; three Bernstein coefficients, and the distance, of sums."""
+    def keep(self, mask: Value, powers: Sequence[Value], off: Sequence[Value]) -> None:
+        """For lanes under the mask: coefficients of 1, τ, τ² of the trend, sums; between what f is off it."""
         e, level = self.lanes, self.level
-        numbers = *(e.multiply_add(row, level.scale, level.shift) for row in rows), self._distance(apart)
-        for kept, own in zip((*self._rows, self._apart), numbers, strict=True):
-            kept.value = e.where(mask, own, kept.value)
-
-    def _distance(self, apart: Value) -> Value:
-        return self.lanes.multiply_add(apart, self.lanes.absolute(self.level.scale), self.level.margin)
+        first, *others = (e.multiply(own, level.scale) for own in powers)
+        own = e.add(first, level.shift), *others, e.subtract(off[0], level.margin), e.add(off[1], level.margin)
+        for variable, value in zip((*self._powers, self._low, self._high), own, strict=True):
+            variable.value = e.where(mask, value, variable.value)
 
     def may_hold(self, start: Value, end: Value) -> Value:
-        """A mask: where the level may be met from start to end, in [0, 1] of the way."""
-        e = self.lanes
-        first, middle, last = (row.value for row in self._rows)
-        before, behind = e.subtract(middle, first), e.subtract(last, middle)
-
-        def along(t: Value) -> tuple[Value, Value]:
-            return e.multiply_add(before, t, first), e.multiply_add(behind, t, middle)
-
-        def blossom(ends: tuple[Value, Value], t: Value) -> Value:
-            return e.multiply_add(e.subtract(ends[1], ends[0]), t, ends[0])
-
-        at_start = along(start)
-        return self._straddles([blossom(at_start, start), blossom(at_start, end), blossom(along(end), end)])
-
-    def _straddles(self, rows: Sequence[Value]) -> Value:
-        """Also where something is not a number."""
-        e, b, apart = self.lanes, self.builder, self._apart.value
-        low = high = rows[0]
-        for row in rows[1:]:
-            low, high = e.minimum(low, row), e.maximum(high, row)
-        above, below = b.fcmp_ordered(">", low, apart), b.fcmp_ordered("<", high, e.negate(apart))
+        """A mask: where the level may be met from start to end, in [0, 1] of the way; also where something is NaN."""
+        e, b = self.lanes, self.builder
+        number, rise, bend = (power.value for power in self._powers)
+        bent = e.multiply(bend, start)
+        half = e.multiply(e.add(start, end), e.constant(0.5))
+        middle = e.multiply_add(bent, end, e.multiply_add(rise, half, number))
+        first = e.multiply_add(e.add(bent, rise), start, number)
+        last = e.multiply_add(e.multiply_add(bend, end, rise), end, number)
+        low, high = e.minimum(e.minimum(first, middle), last), e.maximum(e.maximum(first, middle), last)
+        above = b.fcmp_ordered(">", e.add(low, self._low.value), e.constant(0))
+        below = b.fcmp_ordered("<", e.add(high, self._high.value), e.constant(0))
         return b.not_(b.or_(above, below))
 
 
@@ -91,14 +111,21 @@ class TetrahedralRestriction:
     """
 
     def __init__(
-        self, lanes: Lanes, stencil: TetrahedralStencil, storage: Storage, grid: Grid, room: bool, level: Level
+        self,
+        lanes: Lanes,
+        stencil: TetrahedralStencil,
+        storage: Storage,
+        grid: Grid,
+        room: bool,
+        level: Level,
+        off_trend: OffTrend,
     ) -> None:
         self.lanes, self.builder = lanes, lanes.builder
         self.taps = TetrahedralTaps(lanes, stencil, storage, grid, room)
         self.spline, self.cubes = stencil.spline, Cubes(self.taps.sum)
         self._cuts = [lanes.variable(lanes.constant(0)) for _ in self.spline.cuts]
         self._at = lanes.variable(lanes.constant(0))
-        self.near = NearLevel(lanes, level)
+        self.near, self.off_trend = NearLevel(lanes, level), off_trend
 
     def look(
         self, taps: list[Value], cell: Sequence[Value], start: Sequence[Value], end: Sequence[Value], mask: Value
@@ -108,11 +135,13 @@ class TetrahedralRestriction:
         Args: as of `every`.
         """
         e, b = self.lanes, self.builder
-        way = self._way(cell, start, end)
-        corners = self.taps.around_sample(way.odd) if way.odd else self.taps.at_sample(None)
-        rows, apart = self.cubes.trend(self.taps.blocks(taps, corners, I64(0)), way)
-        self.near.keep(mask, rows, apart)
+        powers = self.cubes.along(self.taps.trend(taps), self._way(cell, start, end))
+        self.near.keep(mask, powers, [self._number(x) for x in self.off_trend.read(cell)])
         return b.and_(mask, self.near.may_hold(e.constant(0), e.constant(1)))
+
+    def _number(self, pack: Value) -> Value:
+        """Floats as numbers of the arithmetic."""
+        return pack if pack.type == self.lanes.pack else self.builder.fpext(pack, self.lanes.pack)
 
     @contextmanager
     def every(

@@ -1,16 +1,17 @@
-"""The programs that cast rays at quadrics, and at blended ones, in Triton (`quadric_walk`)."""
+"""The programs that cast rays at quadrics, and at blended ones, in Triton (`tree_walk`, `quadric_leaves`)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from filterlab.ops.cuda.quadric_walk import ARRAYS, Walk
+from filterlab.ops.cuda.quadric_leaves import QuadricInLeaf, times
 from filterlab.ops.cuda.source import Source, any_of, number
+from filterlab.ops.cuda.tree_walk import ARRAYS, AXES, ROWS, Walk, first_hits
 from filterlab.ops.quadrics import Kept
 from filterlab.ops.slim import INNER, LEAST_WEIGHT, OUTER, STEEP
 
 OWN = {
-    "hits": ("taus", "places"),
+    "hits": ROWS,
     "sheets": ("taus", "begin", "end", "normal", "places"),
     "members": ("begin", "end", "count", "taus", "places"),
 }
@@ -21,7 +22,7 @@ SCALARS = {"hits": ("sheets",), "sheets": ("sheets", "offset"), "members": ("wri
 
 @dataclass(frozen=True)
 class QuadricsVariant:
-    """Everything a program depends on; can be hashed.
+    """Everything a program depends on, see `tree_walk.Variant`.
 
     Attributes:
         asked: "hits", "sheets" or "members".
@@ -39,39 +40,16 @@ class QuadricsVariant:
     def arrays(self) -> tuple[str, ...]:
         return (*ARRAYS, *OWN[self.asked])
 
+    @property
+    def scalars(self) -> tuple[str, ...]:
+        return SCALARS[self.asked]
+
     def write(self) -> Source:
-        arrays = [f"{name}_array" for name in OWN[self.asked]]
-        name = f"quadrics_{self.asked}"
-        walk = Walk(name, arrays, SCALARS[self.asked], self.planes, self.kept, self.reversed)
+        leaf = QuadricInLeaf(self.planes, self.kept, self.reversed)
+        walk = Walk(f"quadrics_{self.asked}", OWN[self.asked], self.scalars, leaf)
         walk.begin()
-        {"hits": _hits, "sheets": _sheets, "members": _members}[self.asked](walk)
+        {"hits": first_hits, "sheets": _sheets, "members": _members}[self.asked](walk)
         return walk.source
-
-
-def _hits(walk: Walk) -> None:
-    """In order into the ray's row."""
-    walk.text("row = ray * sheets")
-
-    def take() -> None:
-        walk.text("hit = hit & (tau < limit)")
-        with walk.source.block(f"if {any_of('hit')}"):
-            walk.text("""
-                carried = tau
-                carried_place = place
-            """)
-            with walk.source.block("for k in range(sheets)"):
-                walk.text("""
-                    there = tl.load(taus_array + row + k, hit, 0.0)
-                    place_there = tl.load(places_array + row + k, hit, 0)
-                    sooner = carried < there
-                    tl.store(taus_array + row + k, tl.where(sooner, carried, there), hit)
-                    tl.store(places_array + row + k, tl.where(sooner, carried_place, place_there), hit)
-                    carried = tl.where(sooner, there, carried)
-                    carried_place = tl.where(sooner, place_there, carried_place)
-                """)
-            walk.text("limit = tl.where(hit, tl.load(taus_array + row + sheets - 1, hit, 0.0), limit)")
-
-    walk.walk("inside", take)
 
 
 def _sheets(walk: Walk) -> None:
@@ -92,9 +70,9 @@ def _sheets(walk: Walk) -> None:
     def add() -> None:
         walk.text("hit = hit & (tau >= sheet_begin) & (tau <= limit)")
         with walk.source.block(f"if {any_of('hit')}"):
-            for a in ("x", "y", "z"):
+            for a in AXES:
                 walk.text(f"y_{a} = q_{a} + root * along_{a}")
-            walk.times("y", "gradient")
+            times(walk, "y", "gradient")
             walk.text(f"""
                 gradient_x = gradient_x + b_x
                 gradient_y = gradient_y + b_y

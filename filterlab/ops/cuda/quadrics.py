@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.cuda.launch import interpreting, launchable
-from filterlab.ops.cuda.quadric_hits import SCALARS, QuadricsVariant
-from filterlab.ops.cuda.quadric_walk import BLOCK, DEEPEST
-from filterlab.ops.quadrics import Quadrics, Rays, in_parts
+from filterlab.ops.cuda.quadric_hits import QuadricsVariant
+from filterlab.ops.cuda.tree_walk import BLOCK, DEEPEST, Variant
+from filterlab.ops.quadrics import InLeaves, Quadrics, Rays, in_parts
 
 RAYS_AT_ONCE = 1 << 17
 
@@ -24,27 +24,38 @@ def hits(
     given: Quadrics, origins: Tensor, directions: Tensor, sheets: int, farthest: bool = False
 ) -> tuple[Tensor, Tensor]:
     """`ops.reference.quadrics.hits`, fused."""
-    cast = lambda o, d: _of_part(given, o, d, sheets, farthest)  # noqa: E731
+    return walked(given, variant_of("hits", given, farthest), origins, directions, sheets, farthest)
+
+
+def variant_of(asked: str, given: Quadrics, reversed: bool) -> QuadricsVariant:
+    """The program that is asked for."""
+    return QuadricsVariant(asked, given.planes, given.kept(reversed), reversed)
+
+
+def walked(
+    given: InLeaves, variant: Variant, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
+) -> tuple[Tensor, Tensor]:
+    """`ops.reference.quadrics.walked`, by the program of that variant."""
+    cast = lambda o, d: _of_part(given, variant, o, d, sheets, farthest)  # noqa: E731
     t, piece = in_parts(cast, origins, directions, RAYS_AT_ONCE)
     return t, piece
 
 
 def _of_part(
-    given: Quadrics, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
+    given: InLeaves, variant: Variant, origins: Tensor, directions: Tensor, sheets: int, farthest: bool
 ) -> tuple[Tensor, Tensor]:
     rays = Rays.of(given.tree, origins, directions, farthest)
     tau = rays.first.new_full((len(origins), sheets), torch.inf)
     place = torch.full_like(tau, -1, dtype=torch.int64)
-    launch("hits", given, rays, {"taus": tau, "places": place}, sheets=sheets)
+    launch(variant, given, rays, {"taus": tau, "places": place}, sheets=sheets)
     return rays.t(tau), given.tree.numbers(place)
 
 
-def launch(asked: str, given: Quadrics, rays: Rays, own: Mapping[str, Tensor], **scalars: int | Tensor) -> None:
+def launch(variant: Variant, given: InLeaves, rays: Rays, own: Mapping[str, Tensor], **scalars: int | Tensor) -> None:
     """Run a program for all rays; `own` is what it reads and writes."""
     count = len(rays.first)
     if not count:
         return
-    variant = QuadricsVariant(asked, given.planes, given.kept(rays.reversed), rays.reversed)
     whole = {name: getattr(rays, name).contiguous() for name in ("start", "along", "first", "last")}
     arrays = {"boxes": given.tree.boxes, "children": given.tree.children, "leaves": given.leaves, **whole, **own}
     arrays["nodes"] = given.tree.children.new_empty(count, DEEPEST)
@@ -52,10 +63,10 @@ def launch(asked: str, given: Quadrics, rays: Rays, own: Mapping[str, Tensor], *
     handed = [arrays[name] for name in variant.arrays]
     program = _program(variant, interpreting())
     with torch.cuda.device_of(given.leaves):  # Triton launches on the current device
-        numbers = [scalars[name] for name in SCALARS[asked]]
+        numbers = [scalars[name] for name in variant.scalars]
         program[(-(-count // BLOCK),)](*handed, *numbers, count, BLOCK=BLOCK, num_warps=1)
 
 
 @lru_cache(maxsize=256)
-def _program(variant: QuadricsVariant, interpreted: bool) -> Any:
+def _program(variant: Variant, interpreted: bool) -> Any:
     return launchable(variant.write())

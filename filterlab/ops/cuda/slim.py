@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from filterlab.ops.cuda.quadrics import RAYS_AT_ONCE, launch
+from filterlab.ops.cuda.quadrics import RAYS_AT_ONCE, launch, variant_of
 from filterlab.ops.quadrics import Rays, in_parts
 from filterlab.ops.slim import Cover, Members, Sheets, members_of
 
@@ -19,7 +19,8 @@ def sheets(given: Cover, origins: Tensor, directions: Tensor, count: int, farthe
 def _of_part(given: Cover, rays: Rays, count: int) -> Sheets:
     found = Sheets.none(rays, count)
     own = {"taus": found.t, "begin": found.begin, "end": found.end, "normal": found.normal, "places": found.piece}
-    launch("sheets", given.quadrics, rays, own, sheets=count, offset=found.t.new_tensor(given.offset))
+    program = variant_of("sheets", given.quadrics, rays.reversed)
+    launch(program, given.quadrics, rays, own, sheets=count, offset=found.t.new_tensor(given.offset))
     return found.of_rays(rays, given.quadrics.tree)
 
 
@@ -27,10 +28,11 @@ def members(given: Cover, origins: Tensor, directions: Tensor, begin: Tensor, en
     """`ops.reference.slim.members`, fused: counted first, then written."""
     rays, quadrics = Rays.of(given.quadrics.tree, origins, directions, False), given.quadrics
     own = {"begin": begin.contiguous(), "end": end.contiguous()}
+    program = variant_of("members", quadrics, rays.reversed)
     count, nowhere = torch.zeros_like(begin, dtype=torch.int64), begin.new_empty(0)
-    launch("members", quadrics, rays, {**own, "count": count, "taus": nowhere, "places": count[:0]}, writes=0)
+    launch(program, quadrics, rays, {**own, "count": count, "taus": nowhere, "places": count[:0]}, writes=0)
     row = torch.arange(len(begin), device=begin.device).repeat_interleave(count)
     tau, place = begin.new_empty(len(row)), torch.empty_like(row)
     starts = count.cumsum(0) - count
-    launch("members", quadrics, rays, {**own, "count": starts, "taus": tau, "places": place}, writes=1)
+    launch(program, quadrics, rays, {**own, "count": starts, "taus": tau, "places": place}, writes=1)
     return members_of(rays, quadrics.tree, row, tau, place)

@@ -25,7 +25,7 @@ from filterlab.ops.differentiable import prefilter as filters
 from filterlab.ops.place import Placement
 from filterlab.ops.prefilter import VOLUME, Filtering
 from filterlab.ops.stencil import Product, Stencil
-from filterlab.ops.tetrahedra import AnyStencil, Tetrahedra, TetrahedralStencil, Trend
+from filterlab.ops.tetrahedra import AnyStencil, Tetrahedra, TetrahedralStencil
 from filterlab.ops.tracing import constant
 from filterlab.prefilters import Prefilter, named
 from filterlab.volume import Boundary
@@ -46,8 +46,7 @@ def stencil_text(stencil: AnyStencil) -> str:
 def stencil_of(text: str) -> AnyStencil:
     known = json.loads(text)
     if isinstance(known, dict):
-        trend = Trend(**_fields(known["spline"].pop("trend")))
-        return TetrahedralStencil(Tetrahedra(**_fields(known["spline"]), trend=trend), _tuples(known["orders"]))
+        return TetrahedralStencil(Tetrahedra(**_fields(known["spline"])), _tuples(known["orders"]))
     tables, rows = known
     kernels = [Kernel(name, tuple(tuple(Fraction(c) for c in piece) for piece in pieces)) for name, pieces in tables]
     return Stencil(

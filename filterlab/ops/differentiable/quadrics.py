@@ -12,8 +12,6 @@ from filterlab.ops.differentiable.drivers import driver, room_of
 from filterlab.ops.differentiable.recording import transforming
 from filterlab.ops.quadrics import InLeaves
 
-_IN_TRITON = ("quadrics",)
-
 
 def missing(given: InLeaves, origins: Tensor) -> str | None:
     """What keeps the program from running here; None: nothing does."""
@@ -23,7 +21,7 @@ def missing(given: InLeaves, origins: Tensor) -> str | None:
     if here != origins.device:
         return f"it works on tensors of one device; got {here} and {origins.device}"
     if here.type == "cuda":
-        return cuda.device_problem(origins) if given.op in _IN_TRITON else f"there is none of {given.op} in Triton"
+        return cuda.device_problem(origins)
     return cpu.llvmlite_problem() if here.type == "cpu" else f"it works on tensors of the CPU or a GPU; got {here}"
 
 

@@ -1,9 +1,10 @@
 """Casting rays at bilinear quadrilaterals in plain torch: what their programs compute, whatever the device.
 
 Roots are taken by the formulas of `ops.reference.quadrics`, in which nothing cancels. What α, β, γ are off by rounding,
-E, moves u by E / 2 s, and v by what that moves and by what places are off, seen across the line that is met: so far may
-they lie beyond [0, 1]. A ray that touches, β² = αγ but for rounding, hits once, as a front. One that lies in a flat
-patch, or on a line of a bent one, does not hit it: whatever it borders on is met there.
+E, moves u by E / 2 s, and points along the edge they are next to by as much of its length: so far may u lie beyond
+[0, 1], and a ray pass by an edge that it meets. A ray that touches, β² = αγ but for rounding, hits once, as a front, if
+the polynomial is 0 there: of rays along a flat patch and beside it α and β are small, and it is not. One that lies in a
+flat patch, or on a line of a bent one, does not hit it: whatever it borders on is met there.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from filterlab.ops.bilinear import ACROSS, CENTER, CORNER, LENGTH, PLACE, SQUARE, TWIST, UP, BilinearQuads
+from filterlab.ops.bilinear import ACROSS, CENTER, CORNER, LENGTH, MEETING, PLACE, SQUARE, TWIST, UP, BilinearQuads
 from filterlab.ops.quadrics import Kept
 from filterlab.ops.reference.quadrics import from_center, stable_roots, walked
 
@@ -54,9 +55,9 @@ def intersections(
 
 
 def _less_parallel(leaf: Tensor, from_corner: Tensor, along: Tensor) -> tuple[_Patch, Tensor]:
-    """Patches with a and d in that order in which D is less parallel to d + h / 2; and whether they changed places."""
+    """Patches with a and d in that order in which D is less parallel to d and d + h; whether they changed places."""
     across, up, twist = leaf[:, ACROSS], leaf[:, UP], leaf[:, TWIST]
-    apart = [_square(_cross(along, line + twist / 2)) for line in (across, up)]
+    apart = [torch.minimum(*(_square(_cross(along, edge)) for edge in (line, line + twist))) for line in (across, up)]
     turned = apart[0] > apart[1]
     first, second = (torch.where(turned[:, None], *pair) for pair in ((up, across), (across, up)))
     return _Patch(from_corner, first, second, twist, along, leaf[:, LENGTH], leaf[:, PLACE]), turned
@@ -75,7 +76,9 @@ def _roots(patch: _Patch) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     front = torch.where(touches, -beta / alpha, front)
     off = torch.where(touches, slack.sqrt() / alpha.abs(), rounding / (2 * s))
     in_it = torch.maximum(torch.maximum(alpha.abs(), beta.abs()), gamma.abs()) <= rounding
-    return torch.where(in_it, torch.nan, front), torch.where(in_it, torch.nan, back), touches, off
+    u = front.clamp(0, 1)
+    beside = touches & (((alpha * u + 2 * beta) * u + gamma).abs() > MEETING * rounding)
+    return torch.where(in_it | beside, torch.nan, front), torch.where(in_it, torch.nan, back), touches, off
 
 
 def _along(patch: _Patch, u: Tensor, off: Tensor) -> Tensor:
@@ -86,9 +89,11 @@ def _along(patch: _Patch, u: Tensor, off: Tensor) -> Tensor:
     n = _cross(patch.along, line)
     square = _square(n)
     v = _dot(_cross(way, patch.along), n) / square
-    off = (patch.place + 3 * patch.length * off) / square.sqrt()
-    within = within & (v >= -off) & (v <= 1 + off)
-    return torch.where(within, _dot(_cross(way, line), n) / square, torch.nan)
+    inner = v.clamp(0, 1)
+    point, edge = way + inner[:, None] * line, patch.across + inner[:, None] * patch.twist
+    near = (v - inner).abs() * square.sqrt() <= patch.place + 3 * off.clamp_max(1) * _square(edge).sqrt()
+    meets = _dot(point, _cross(patch.along, edge)).abs() <= MEETING * patch.length * patch.place
+    return torch.where(within & ((v == inner) | (near & meets)), _dot(point, patch.along), torch.nan)
 
 
 def _dot(x: Tensor, y: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from filterlab import bernstein
-from filterlab.ops.bounds import CODES, Bounds, Codes
+from filterlab.ops.bounds import CODES, Bounds, Codes, in_pairs, tells_off_trend
 from filterlab.ops.pieces import Lattice
 from filterlab.ops.raycast import bits_of
 from filterlab.ops.reference import tetrahedra
@@ -35,7 +35,8 @@ def bounds(lattice: AnyLattice, edge: int, codes: Codes) -> Bounds:
         least, most = low.where(finite, math.inf).min(), high.where(finite, -math.inf).max()
         ends = min(ends[0], float(least)), max(ends[1], float(most))
     low, high = (torch.cat(own) for own in zip(*parts, strict=True))
-    return Bounds(low, high, ends)
+    off_trend = [in_pairs(*own) for own in _layers_of_cubes(lattice, edge, True)] if tells_off_trend(lattice) else None  # type: ignore[arg-type]
+    return Bounds(low, high, ends, None if off_trend is None else torch.cat(off_trend))
 
 
 def bits_of_blocks(low: Tensor, high: Tensor, least: Tensor, most: Tensor, below: int, above: int) -> Tensor:
@@ -79,13 +80,15 @@ def layers_of(lattice: AnyLattice, edge: int) -> Iterator[tuple[Tensor, Tensor]]
         yield low, high
 
 
-def _layers_of_cubes(lattice: TetrahedralLattice, edge: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """The same of a spline on tetrahedra."""
+def _layers_of_cubes(
+    lattice: TetrahedralLattice, edge: int, off_trend: bool = False
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """The same of a spline on tetrahedra, f or f − t."""
     values, (_, _, size), (_, _, depth) = lattice.coefficients.detach(), lattice.supports, lattice.cells
     for first in range(0, depth, _AT_ONCE):
         cells = min(_AT_ONCE, depth - first)
         slab = lattice.scale * values.narrow(0, first, cells + size - 1).double() + lattice.shift
-        low, high = tetrahedra.hulls_of_cubes(slab, lattice.spline)
+        low, high = tetrahedra.hulls_of_cubes(slab, lattice.spline, off_trend)
         for dim in range(3):
             low, high = over_windows(torch.amin, low, dim, edge, 0), over_windows(torch.amax, high, dim, edge, 0)
         yield low, high

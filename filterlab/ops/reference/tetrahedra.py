@@ -5,13 +5,23 @@ Letters as in `ops.reference.gather`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
 
 import torch
 from torch import Tensor
 
-from filterlab.ops.tetrahedra import Block, Rows, Steps, Sum, Tetrahedra, TetrahedralStencil, at_centre
+from filterlab.ops.tetrahedra import (
+    QUADRATICS,
+    Block,
+    Rows,
+    Steps,
+    Sum,
+    Tetrahedra,
+    TetrahedralStencil,
+    at_centre,
+    trend_of,
+)
 
 
 class Tensors:
@@ -118,15 +128,16 @@ _NUMBERS_AT_ONCE = 1 << 20
 """Coefficients of as many layers of cubes, or of one: they stay in cache."""
 
 
-def hulls_of_cubes(samples: Tensor, spline: Tetrahedra) -> tuple[Tensor, Tensor]:
+def hulls_of_cubes(samples: Tensor, spline: Tetrahedra, off_trend: bool = False) -> tuple[Tensor, Tensor]:
     """(least, greatest) Bernstein coefficient of every cube about a sample, NaN where a sample is not finite.
 
     Args:
         samples: (D, H, W), also those that the outermost cubes need; cubes are counted from an even index on.
+        off_trend: of f − t (`ops.bounds`), not of f.
     """
     low, high = (samples.new_empty([n - 2 * spline.around for n in samples.shape]) for _ in range(2))
     parts = _where_octahedra_meet(samples, spline) if spline.octahedral else _windows(samples, spline)
-    for place, inputs, masks in parts:
+    for place, inputs, masks in _without_trend(parts, samples, spline) if off_trend else parts:
         weights, shape = samples.new_tensor(masks), inputs[0].shape
         layers = max(1, _NUMBERS_AT_ONCE // max(1, len(masks) * shape[1] * shape[2]))
         found = [
@@ -140,6 +151,20 @@ def hulls_of_cubes(samples: Tensor, spline: Tetrahedra) -> tuple[Tensor, Tensor]
 
 _Inputs = tuple[tuple[slice, ...], list[Tensor], Sequence[Sequence[float]]]
 """Of some cubes: which, the numbers that their coefficients are made of, and the masks of these."""
+
+
+def _without_trend(parts: Iterable[_Inputs], samples: Tensor, spline: Tetrahedra) -> Iterator[_Inputs]:
+    """What is left when t is taken off: ten inputs more, its coefficients along the axes of each cube."""
+    count = [n - 2 * spline.around for n in samples.shape]
+    trend = trend_of(Tensors(samples), lambda at: _from(samples, [spline.around + k for k in reversed(at)], count, 1))
+    for cubes, inputs, masks in parts:
+        odd = [isinstance(own, slice) and own.start == 1 for own in cubes[::-1]]
+        turned = (sum(k for k, own in zip(m, odd, strict=True) if own) % 2 for m in QUADRATICS)
+        own = [
+            -trend[m][cubes] if negative else trend[m][cubes] for m, negative in zip(QUADRATICS, turned, strict=True)
+        ]
+        less = [[*mask, *(-c for c in moments)] for mask, moments in zip(masks, spline.moments, strict=True)]
+        yield cubes, [*inputs, *own], less
 
 
 def _windows(samples: Tensor, spline: Tetrahedra) -> Iterator[_Inputs]:

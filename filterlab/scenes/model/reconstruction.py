@@ -82,7 +82,8 @@ class SceneMethod(Reconstruction):
 
     name: Annotated[str, AfterValidator(Names("method", lambda: (*METHODS, AUTO)))] = "triquadratic"
     """Of a method; or `auto`: the cheapest one whose error on this volume stays within `max_error`, with the scheme,
-    the storage and (unless the scene has one) the step that `filterlab recommend` finds for pictures."""
+    the storage and (unless the scene has one) the step that `filterlab recommend` finds: for a surface by the errors
+    next to its level, for slices by those of values, else for dvr."""
     max_error: (
         Annotated[float, BeforeValidator(part), Field(gt=0), Told(unit="parts of the values' range, or %")] | None
     ) = None
