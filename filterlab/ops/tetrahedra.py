@@ -403,28 +403,30 @@ def at_centre(arithmetic: Arithmetic, block: Block) -> Rows:
 
 
 def trend_of(arithmetic: Arithmetic, at: Callable[[Steps], Value]) -> Rows:
-    """Coefficients of `QUADRATICS` of t, which is near the spline in the cube about a sample: t = q + Δq / 8.
+    """Coefficients of `QUADRATICS` of t, which is near the spline in the cube about a sample.
 
-    q is the quadratic with the sample's value and the central differences of those around it.
+    Of samples of a quadratic q the spline is q + Δq / 8, and so is t. Second derivatives are differences of samples; a
+    slope is ¼ of the central difference in the middle and 3/16 of each of the four beside it: of samples of x y² the
+    spline is about x y² + x / 4, to which 3/8 x is nearest.
 
     Args:
         at: samples by their steps from the one in the middle.
     """
-    e = arithmetic
-    number = middle = at((0, 0, 0))
-    rows: Rows = {}
+    e, middle = arithmetic, at((0, 0, 0))
+    number, slopes, rows = middle, {}, {}
     for unit in UNITS:
         ahead, behind = at(unit), at(_moved_by(unit, unit, -2))
-        rows[unit] = e.multiply(e.subtract(ahead, behind), e.constant(0.5))
-        rows[_moved_by(unit, unit)] = bend = e.subtract(e.multiply(e.add(ahead, behind), e.constant(0.5)), middle)
-        number = e.multiply_add(bend, e.constant(0.25), number)
+        slopes[unit] = e.multiply(e.subtract(ahead, behind), e.constant(1 / 8))
+        rows[_moved_by(unit, unit)] = bend = e.subtract(e.multiply(e.add(ahead, behind), e.constant(1 / 2)), middle)
+        number = e.multiply_add(bend, e.constant(1 / 4), number)
     for first, second in combinations(UNITS, 2):
-        corners = [
-            at(_moved_by(_moved_by((0, 0, 0), first, i), second, j)) for i, j in ((1, 1), (-1, -1), (1, -1), (-1, 1))
-        ]
-        alike, apart = e.add(*corners[:2]), e.add(*corners[2:])
-        rows[_moved_by(first, second)] = e.multiply(e.subtract(alike, apart), e.constant(0.25))
-    return {(0, 0, 0): number, **rows}
+        corner, beside = _moved_by(first, second), _moved_by(first, second, -1)
+        (a, b), (c, d) = ((at(x), at(_moved_by(x, x, -2))) for x in (corner, beside))
+        diagonals = e.subtract(a, b), e.subtract(c, d)
+        for unit, write in ((first, e.add), (second, e.subtract)):
+            slopes[unit] = e.multiply_add(write(*diagonals), e.constant(3 / 32), slopes[unit])
+        rows[corner] = e.multiply(e.subtract(e.add(a, b), e.add(c, d)), e.constant(1 / 4))
+    return {(0, 0, 0): number, **slopes, **rows}
 
 
 def _moved_by(at: Steps, by: Steps, times: int = 1) -> Steps:
