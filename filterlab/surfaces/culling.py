@@ -44,7 +44,8 @@ class Local(NamedTuple):
     corners: Tensor | None
 
     def some(self, kept: Tensor) -> Local:
-        return Local(*(None if x is None else x[kept] for x in self))
+        corners = None if self.corners is None else self.corners[kept]
+        return Local(self.A[kept], self.b[kept], self.c[kept], self.radii[kept], corners)
 
 
 class Polar(NamedTuple):

@@ -259,5 +259,6 @@ class Quadrics(InTree[description.Quadrics]):
         """(M,) whether some point within the bounds may show the side that counts to a world point (3,)."""
         bounds, sign = self.bounds, 1 if self.faces == "front" else -1
         corners = None if bounds.corners is None else bounds.corners - bounds.centers[:, None]
-        local = culling.Local(*(sign * x for x in self._about_centers()), bounds.radii, corners)
+        A, b, c = self._about_centers()
+        local = culling.Local(sign * A, sign * b, sign * c, bounds.radii, corners)
         return culling.facing(local, eye.detach().to(bounds.centers) - bounds.centers, self._slack)
