@@ -288,13 +288,12 @@ def crossings_of_patch(corners: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.
         moved = np.where(touches, np.sqrt(2 * slack)[:, None] / np.abs(c2)[:, None], SURE / np.abs(s)[:, None])
         off = (SURE + moved) / np.sqrt(square) + SURE * np.abs(start)[:, None] * 1e-4
         inner = np.minimum(np.minimum(u, 1 - u), np.minimum(w, 1 - w))
-        ahead = t > 1e-9
         lies = (np.abs((c0, c1, c2)).max(0) <= 10 * SURE)[:, None]
         t, off = np.where(lies, start[:, None], t), np.where(lies, 2, off)
         nearest = np.clip(w, 0, 1)  # for one that touches: a ray may be at right angles with a flat patch's normal
         meets = np.abs((c2[:, None] * nearest + 2 * c1[:, None]) * nearest + c0[:, None]) <= 10 * SURE
-        may = (inner > -off) & ahead & (meets | ~touches) | lies
-        return t, 10 * off, (inner > off) & ahead & ~touches & ~lies, may
+        may = (inner > -off) & (t > -10 * off) & (meets | ~touches) | lies
+        return t, 10 * off, (inner > off) & (t > 10 * off) & ~touches & ~lies, may
 
 
 def at_points(rng: Rng, corners: np.ndarray, count: int) -> Rays:

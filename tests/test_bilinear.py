@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.differentiable import quadrics as ops
-from filterlab.render import PerspectiveCamera, raycast
+from filterlab.render import OrthographicCamera, PerspectiveCamera, raycast
 from filterlab.surfaces import BilinearQuads, Quadrics, Tetrahedra
 
 F64 = torch.float64
@@ -309,6 +309,18 @@ def test_an_image():
     assert 0.2 < float(covered.mean()) < 0.7
     assert bool(image["color"].isfinite().all())
     assert (image["normal"].norm(dim=-1) - covered).abs().max() < 1e-6
+
+
+def test_a_box_seen_along_its_faces():
+    """Turned anyhow, so that rays along faces are at right angles with their normals to within rounding only."""
+    turn = torch.linalg.qr(numbers(3, 3, seed=30))[0]
+    ends = torch.tensor([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=F64) - 0.5
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    box = BilinearQuads((ends[..., None, :] * turn).sum(-1), torch.tensor(quads))
+    way, up = ([float(x) for x in turn[:, k]] for k in (0, 2))
+    camera = OrthographicCamera(position=tuple(-3 * x for x in way), target=(0, 0, 0), up=tuple(up), height=1.6)
+    image = raycast(box, camera, size=(32, 32), dtype=F64)
+    assert float(image[..., 3].sum()) == 20**2
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------

@@ -310,3 +310,40 @@ def test_normals_near_an_edge_are_of_one_of_its_sides():
     points = torch.from_numpy(cube(4000)) / 12**0.5
     scan, _ = scan_of(points, points, 0, lambda part: None)
     assert float((scan.normals.abs().amax(1) > 0.999).double().mean()) > 0.9
+
+
+# a cube [-1, 1]³ without its octant x, y, z > 0: three corners of its notch have two convex edges and a concave one
+
+
+def notched(count: int) -> np.ndarray:
+    """Points of the surface: those of the cube that are not at the octant, and of the octant's three walls."""
+    outer = cube(count)
+    wall = np.random.default_rng(1).uniform(0, 1, (count // 8, 3))
+    wall[np.arange(len(wall)), np.arange(len(wall)) % 3] = 0
+    return np.concatenate((outer[~(outer > 0).all(1)], wall))
+
+
+@cache
+def notched_cover() -> Slim:
+    return fit_slim(notched(4000))
+
+
+def test_corners_of_mixed_edges_are_sharp():
+    fit = notched_cover().fit
+    assert fit is not None
+    assert fit.smallest == 0
+    assert fit.rms < 0.1 * fit.tolerance
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_rays_beside_corners_of_mixed_edges_meet_the_wall_that_is_there(axis):
+    """Along the axis at the walls, the two faces beside the notch; 2 % of the notch off its edges."""
+    o = np.random.default_rng(axis).uniform(-0.5, 0.98, (2000, 3))
+    o = o[(np.abs(np.delete(o, axis, 1)) > 0.02).all(1)]
+    o[:, axis] = 3
+    direction = np.zeros_like(o)
+    direction[:, axis] = -1
+    hit = notched_cover().hit(torch.from_numpy(o), torch.from_numpy(direction))
+    within = (np.delete(o, axis, 1) > 0).all(1)
+    off = np.abs(hit.t.numpy() - np.where(within, 3.0, 2.0))
+    assert (off > 1e-3).mean() < 2e-3

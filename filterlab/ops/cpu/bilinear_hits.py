@@ -22,14 +22,21 @@ class BilinearVariant(RowsVariant):
         return _Program(self, function)
 
 
+class _Line(NamedTuple):
+    """Eight vectors x, and D × x."""
+
+    x: list[Value]
+    crossed: list[Value]
+
+
 class _Patch(NamedTuple):
-    """Eight patches and a ray: Q, a, d, h, D; L; what places are off by."""
+    """Eight patches and a ray: Q, D; a, d, h; L; what places are off by."""
 
     from_corner: list[Value]
-    across: list[Value]
-    up: list[Value]
-    twist: list[Value]
     along: list[Value]
+    across: _Line
+    up: _Line
+    twist: _Line
     length: Value
     place: Value
 
@@ -55,26 +62,34 @@ class _Program(Rows):
     def _less_parallel(self, base: Value, ray: Ray, q: list[Value]) -> tuple[_Patch, Value]:
         """Patches with a and d in that order in which D is less parallel to d and d + h; where they changed places."""
         e, b = self.lanes, self.builder
-        across, up, twist = (self._vector(base, rows) for rows in (ACROSS, UP, TWIST))
-        edges = (self._edges(line, twist) for line in (across, up))
-        apart = [e.minimum(*(self._square(self._cross(ray.along, x)) for x in pair)) for pair in edges]
+        vectors = (self._vector(base, rows) for rows in (ACROSS, UP, TWIST))
+        across, up, twist = (_Line(x, self._cross(ray.along, x)) for x in vectors)
+        apart = [self._apart(line, twist) for line in (across, up)]
         turned = b.fcmp_ordered(">", apart[0], apart[1])
-        first, second = ([e.where(turned, x, y) for x, y in zip(*p, strict=True)] for p in ((up, across), (across, up)))
+        first, second = (self._either(turned, *pair) for pair in ((up, across), (across, up)))
         corner = self._vector(base, CORNER)
         from_corner = [e.subtract(x, c) for x, c in zip(q, corner, strict=True)]
         length, place = self.rows(base, [LENGTH, PLACE])
-        return _Patch(from_corner, first, second, twist, ray.along, length, place), turned
+        return _Patch(from_corner, ray.along, first, second, twist, length, place), turned
 
-    def _edges(self, line: list[Value], twist: list[Value]) -> tuple[list[Value], list[Value]]:
-        """The two that lines of a family begin and end with."""
-        return line, [self.lanes.add(x, t) for x, t in zip(line, twist, strict=True)]
+    def _apart(self, line: _Line, twist: _Line) -> Value:
+        """|D × x|² of that of the edges x and x + h which D is more parallel to."""
+        e = self.lanes
+        other = [e.add(x, t) for x, t in zip(line.crossed, twist.crossed, strict=True)]
+        return e.minimum(self._square(line.crossed), self._square(other))
+
+    def _either(self, mask: Value, one: _Line, other: _Line) -> _Line:
+        return _Line(
+            *([self.lanes.where(mask, x, y) for x, y in zip(*p, strict=True)] for p in zip(one, other, strict=True))
+        )
 
     def _roots(self, patch: _Patch) -> tuple[Value, Value, Value, Value, Value]:
         """u of front and back; masks of those that are one, and by what they are off; a mask of rays that meet any."""
         e, b = self.lanes, self.builder
-        moment, side = self._cross(patch.from_corner, patch.along), self._cross(patch.across, patch.along)
-        gamma, alpha = self.dot(moment, patch.up), e.negate(self.dot(side, patch.twist))
-        beta = e.multiply(e.constant(0.5), e.subtract(self.dot(moment, patch.twist), self.dot(side, patch.up)))
+        moment = self._cross(patch.from_corner, patch.along)
+        gamma, alpha = self.dot(moment, patch.up.x), self.dot(patch.across.crossed, patch.twist.x)
+        twice = e.add(self.dot(moment, patch.twist.x), self.dot(patch.across.crossed, patch.up.x))
+        beta = e.multiply(e.constant(0.5), twice)
         rounding = e.multiply(patch.length, patch.place)
         radicand = self.difference(beta, alpha, gamma)
         a, h, g = (e.absolute(x) for x in (alpha, beta, gamma))
@@ -95,28 +110,30 @@ class _Program(Rows):
         e, b = self.lanes, self.builder
         within = self._in_unit(u, off)
         u = e.clamp(u, e.constant(0), e.constant(1))
-        line = self._line(patch.up, u, patch.twist)
-        way = [e.subtract(e.multiply(u, x), c) for x, c in zip(patch.across, patch.from_corner, strict=True)]
-        n = self._cross(patch.along, line)
+        line, n = self._line(patch.up, u, patch.twist)
+        way = [e.subtract(e.multiply(u, x), c) for x, c in zip(patch.across.x, patch.from_corner, strict=True)]
         square = self._square(n)
         v = e.divide(self.dot(self._cross(way, patch.along), n), square)
         inner = e.clamp(v, e.constant(0), e.constant(1))
-        point, edge = self._line(way, inner, line), self._line(patch.across, inner, patch.twist)
+        point = [e.multiply_add(inner, x, w) for x, w in zip(line, way, strict=True)]
         by = e.multiply(e.absolute(e.subtract(v, inner)), e.square_root(square))
-        on_line = b.or_(b.fcmp_ordered("==", v, inner), self._at_edge(patch, point, edge, off, by))
-        return self.dot(point, patch.along), b.and_(within, on_line)
+        at_edge = self._at_edge(patch, point, self._line(patch.across, inner, patch.twist), off, by)
+        return self.dot(point, patch.along), b.and_(within, b.or_(b.fcmp_ordered("==", v, inner), at_edge))
 
-    def _at_edge(self, patch: _Patch, point: list[Value], edge: list[Value], off: Value, by: Value) -> Value:
+    def _at_edge(self, patch: _Patch, point: list[Value], edge: _Line, off: Value, by: Value) -> Value:
         """Where rays that pass by S(u, v), at the edge of a patch, meet the edge, u and places being so far off."""
         e, b = self.lanes, self.builder
-        length = e.square_root(self._square(edge))
+        length = e.square_root(self._square(edge.x))
         reach = e.multiply_add(e.multiply(e.constant(3), e.minimum(off, e.constant(1))), length, patch.place)
-        apart = e.absolute(self.dot(point, self._cross(patch.along, edge)))
+        apart = e.absolute(self.dot(point, edge.crossed))
         rounding = e.multiply(e.constant(MEETING), e.multiply(patch.length, patch.place))
         return b.and_(b.fcmp_ordered("<=", by, reach), b.fcmp_ordered("<=", apart, rounding))
 
-    def _line(self, start: list[Value], at: Value, way: list[Value]) -> list[Value]:
-        return [self.lanes.multiply_add(at, w, s) for s, w in zip(start, way, strict=True)]
+    def _line(self, start: _Line, at: Value, way: _Line) -> _Line:
+        e = self.lanes
+        return _Line(
+            *([e.multiply_add(at, w, s) for s, w in zip(*p, strict=True)] for p in zip(start, way, strict=True))
+        )
 
     def _in_unit(self, x: Value, off: Value) -> Value:
         e, b = self.lanes, self.builder

@@ -7,8 +7,8 @@ is kept whatever its misfit. A point is covered when the weights of the balls th
 
 A ball meets the tolerance if the root of the weighted mean of squared distances of its points is within it, and none
 is further off than four times that. Points whose normals look the other way, as those of a wall behind, are not its
-own. If one graph does not meet it, two that share a sharp edge are tried, then three that share a corner
-(`surfaces.fitting.edges`).
+own. If one graph does not meet it, or goes on through points of another side, two that share a sharp edge are tried,
+then three that share a corner (`surfaces.fitting.edges`).
 
 Source: Ohtake, Belyaev & Alexa, Sparse low-degree implicit surfaces with applications to high quality rendering,
 feature extraction, and smoothing, 2005, whose balls minimise an error instead.
@@ -51,6 +51,9 @@ _FIRST = 60  # points, about, by which balls are tried at first
 _DOUBTFUL = 1.3  # times the tolerance, by them
 _LOOSE = 48  # points, from which on a ball may not reach across what was not scanned
 _SLACK = 0.5  # spacings beyond a plane that a point at an edge of its side may be
+_POOR = 4.0  # tolerances that one graph misses, where points rather lie at an edge than are noise
+_UNSURE = 1.01  # tolerances that edges and corners miss at least, if a side of them has few points
+_BEYOND = 1.5  # spacings from a graph, at most, points of another side are where it crosses a sharp edge
 _AWAY = -0.5  # n·m of normals on both sides of an edge, at least
 
 
@@ -136,23 +139,24 @@ class Cover:
             return hopeful
         for some, pairs in scan.levels[level].parts(scan.points[numbers], radii):
             tried = _tried(scan, numbers[some], radii[some], pairs, _DOUBTFUL * self.tolerance, self.order)
-            hopeful[some] = tried.good | tried.sharp
+            hopeful[some] = tried.met.any(1)
         return hopeful
 
     def _take_part(self, numbers: Tensor, radii: Tensor, last: Tensor, pairs: Pairs) -> Tensor:
         """(M,) which of the balls are kept."""
         tried = _tried(self.scan, numbers, radii, pairs, self.tolerance, self.order)
-        unmet = last & ~tried.good & ~tried.sharp
-        self._keep(tried.single, tried.good | unmet)
-        for fits, own in tried.shared:
-            self._keep(fits, own)
-            self.sharp += int(own.sum())
-        self.smallest += int(unmet.sum())
-        kept = tried.good | tried.sharp | last
+        chosen = tried.chosen(last)
+        for kind, (fits, balls) in enumerate(tried.kinds):
+            own = (chosen[balls] == kind).repeat_interleave(len(fits.graphs.centers) // max(len(balls), 1))
+            self.sharp += self._keep(fits, own) * (kind > 0)
+        self.smallest += int((last & ~tried.met.any(1)).sum())
+        kept = chosen >= 0
         self.weight[numbers[kept]] = self.weight[numbers[kept]].clamp_min(ENOUGH)  # whatever its normal
         return kept
 
-    def _keep(self, fits: Fits, kept: Tensor) -> None:
+    def _keep(self, fits: Fits, kept: Tensor) -> int:
+        """Those of a mask (M,) that have points; how many these are."""
+        kept = kept & (torch.bincount(fits.pairs.ball, minlength=len(kept)) > 0)
         own = kept[fits.pairs.ball]
         w, point = weight(fits.pairs.square[own]), fits.pairs.point[own]
         self.weight.index_add_(0, point, w)
@@ -161,50 +165,58 @@ class Cover:
         self.cuts.append(fits.cuts[kept])
         self.counts.append(torch.bincount(fits.pairs.ball[own], minlength=len(kept))[kept])
         self.members.append(point[fits.pairs.ball[own].argsort(stable=True)])
+        return int(kept.sum())
 
 
 class Tried(NamedTuple):
     """What is known of balls (M,).
 
     Attributes:
-        single: a graph for each. good: (M,) whether it meets the tolerance.
-        shared: two graphs for some of the others, three for some of the rest, and which of them are good.
-        sharp: (M,) whose graphs these are.
+        kinds: one graph for each; two for some, that share an edge; a corner for some: with the numbers of their balls.
+        misfits: (M, 3) of these, in tolerances, more than one where a side has few points; ∞ where there are none.
     """
 
-    single: Fits
-    good: Tensor
-    shared: list[tuple[Fits, Tensor]]
-    sharp: Tensor
+    kinds: list[tuple[Fits, Tensor]]
+    misfits: Tensor
+
+    @property
+    def met(self) -> Tensor:
+        """(M, 3) which meet the tolerance."""
+        return self.misfits <= 1
+
+    def chosen(self, last: Tensor) -> Tensor:
+        """(M,) which kind is kept, −1 for none: the first that meets the tolerance; of the last balls one graph, or the
+        best where that is poor."""
+        best = torch.where(self.misfits[:, 0] > _POOR, self.misfits.argmin(1), 0)
+        return torch.where(self.met.any(1), self.met.long().argmax(1), torch.where(last, best, -1))
 
 
 def _tried(scan: Scan, numbers: Tensor, radii: Tensor, pairs: Pairs, tolerance: float, order: int) -> Tried:
-    """One graph in each ball around points; two or three where that does not meet the tolerance."""
+    """One graph in each ball around points; an edge or a corner where that does not meet the tolerance."""
     centers, spacing = scan.points[numbers], scan.spacing[numbers]
-    own, mean = _facing(scan, numbers, pairs, 0.0)
+    faces, mean = _facing(scan, numbers, pairs, 0.0)
+    sides, _ = _facing(scan, numbers, pairs, _AWAY)
+    own = pairs.where(faces)
     graphs = fitted(scan.points, own, centers, radii, mean, order)
-    single, good = _judged(scan, spacing, graphs, own, tolerance, None)
-    tried = Tried(single, good, [], torch.zeros_like(good))
-    own, _ = _facing(scan, numbers, pairs, _AWAY)
-    for each in (2, 3):
-        rest = (~good & ~tried.sharp).nonzero()[:, 0]
-        some = own.of(_mask(rest, len(good)))
-        side, bent = (by_normals if each == 2 else by_three_normals)(scan.normals, some, len(rest))
+    single, misfit = _judged(scan, spacing, graphs, own, tolerance, None)
+    misfit[_crossing(scan, spacing, graphs, pairs.where(sides & ~faces))] = torch.inf
+    tried = Tried([(single, torch.arange(len(numbers)))], torch.full((len(numbers), 3), torch.inf, dtype=misfit.dtype))
+    tried.misfits[:, 0] = misfit
+    own = pairs.where(sides)
+    for kind, sides_of in enumerate((by_normals, by_three_normals), 1):
+        rest = (~tried.met.any(1)).nonzero()[:, 0]
+        some = own.of(_mask(rest, len(numbers)))
+        side, bent = sides_of(scan.normals, some, len(rest))
         rest, some, side = rest[bent], some.of(bent), side[bent[some.ball]]
-        if not len(rest):
-            continue
-        given = scan.points, scan.normals, some
-        found = (
-            edges_in(*given, side, centers[rest], radii[rest], order)
-            if each == 2
-            else corners_in(*given, side, _SLACK * spacing[rest], centers[rest], radii[rest], order)
-        )
-        fits, met = _judged(
-            scan, spacing[rest].repeat_interleave(each), found.graphs, found.pairs, tolerance, found.cuts
-        )
-        met = found.valid & met.reshape(-1, each).all(1)
-        tried.sharp[rest] = met
-        tried.shared.append((fits, met.repeat_interleave(each)))
+        given = scan.points, scan.normals, some, side
+        at = centers[rest], radii[rest], order
+        found = edges_in(*given, *at) if kind == 1 else corners_in(*given, _SLACK * spacing[rest], *at)
+        each = spacing[rest].repeat_interleave(len(found.graphs.centers) // max(len(rest), 1))
+        fits, misfit = _judged(scan, each, found.graphs, found.pairs, tolerance, found.cuts)
+        misfit = misfit.reshape(len(rest), -1).amax(1) if len(rest) else misfit
+        misfit = torch.where(found.sure, misfit, misfit.clamp_min(_UNSURE))
+        tried.misfits[rest, kind] = torch.where(found.valid, misfit, torch.inf)
+        tried.kinds.append((fits, rest))
     return tried
 
 
@@ -215,27 +227,35 @@ def _mask(numbers: Tensor, count: int) -> Tensor:
 def _judged(
     scan: Scan, spacing: Tensor, graphs: Graphs, pairs: Pairs, tolerance: float, cuts: Tensor | None
 ) -> tuple[Fits, Tensor]:
-    """The fits, with planes at ends, and (M,) whether they meet the tolerance."""
+    """The fits, with planes at ends, and by how many tolerances (M,) they miss; ∞ where they reach across no points."""
     off, count = graphs.distances(scan.points[pairs.point], pairs.ball), len(graphs.centers)
     w = weight(pairs.square)
     sums = summed(torch.stack((w, w * off * off, torch.ones_like(w)), 1), pairs.ball, count)
-    met = sums[:, 1] <= tolerance**2 * sums[:, 0]
-    met &= highest(off.abs(), pairs.ball, count) <= _WORST * tolerance
+    misfit = (sums[:, 1] / sums[:, 0].clamp_min(torch.finfo(w.dtype).tiny)).sqrt()
+    misfit = torch.maximum(misfit, highest(off.abs(), pairs.ball, count) / _WORST) / tolerance
     planes, loose = ends_in(scan.points, scan.ends, spacing, graphs, pairs)
-    met &= (loose == 0) | (sums[:, 2] < _LOOSE)
+    misfit[(loose > 0) & (sums[:, 2] >= _LOOSE)] = torch.inf
     edges = none(planes).expand(count, EDGES, 4).clone()
     if cuts is not None:
         edges[:, : cuts.shape[1]] = cuts
-    return Fits(graphs, pairs, off, torch.cat((planes, edges), 1)), met
+    return Fits(graphs, pairs, off, torch.cat((planes, edges), 1)), misfit
 
 
-def _facing(scan: Scan, numbers: Tensor, pairs: Pairs, least: float) -> tuple[Pairs, Tensor]:
-    """Pairs of points whose normals agree with that of the ball's, and these, (M, 3): means, but of their centres'."""
+def _facing(scan: Scan, numbers: Tensor, pairs: Pairs, least: float) -> tuple[Tensor, Tensor]:
+    """(P,) which points have normals that agree with that of the ball's, and these, (M, 3): means, but of their
+    centres'."""
     own = scan.normals[numbers]
-    pairs = pairs.where((scan.normals[pairs.point] * own[pairs.ball]).sum(-1) > least)
-    mean = unit(summed(weight(pairs.square)[:, None] * scan.normals[pairs.point], pairs.ball, len(numbers)))
+    faces = (scan.normals[pairs.point] * own[pairs.ball]).sum(-1) > least
+    some = pairs.where(faces)
+    mean = unit(summed(weight(some.square)[:, None] * scan.normals[some.point], some.ball, len(numbers)))
     mean = torch.where((mean * own).sum(-1, keepdim=True) > 0, mean, own)
-    return pairs.where((scan.normals[pairs.point] * mean[pairs.ball]).sum(-1) > least), mean
+    return faces & ((scan.normals[pairs.point] * mean[pairs.ball]).sum(-1) > least), mean
+
+
+def _crossing(scan: Scan, spacing: Tensor, graphs: Graphs, others: Pairs) -> Tensor:
+    """(M,) whether a graph goes on through points of another side: beyond a sharp edge."""
+    near = graphs.distances(scan.points[others.point], others.ball).abs() < _BEYOND * spacing[others.ball]
+    return torch.bincount(others.ball[near], minlength=len(spacing)) > 0
 
 
 def _apart(points: Tensor, numbers: Tensor, radius: float, drawn: np.random.Generator) -> Tensor:

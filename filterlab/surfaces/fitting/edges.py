@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from filterlab.ops.reference.slim import weight
+from filterlab.surfaces.bounds import plane_distances
 from filterlab.surfaces.fitting.graphs import Graphs, Pairs, fitted, summed, unit
 
 CUTS = 4
@@ -33,23 +34,25 @@ _MIDDLE = 1 / 3  # of that range, in which
 _FEW_BETWEEN = 0.25  # of them are, at most: a third are where a surface bends evenly
 _ROUNDS = 3  # of fitting and dividing points by the plane
 _STEPS = 4  # of Newton's method
-_EACH = 6  # points, at least
-_FEWEST = 4  # of a side of a corner
+_FEWEST = 3  # points of a side
+_ENOUGH = 6, 4  # of the sides of an edge, of a corner, to be sure of it
 _AGREE = 0.9  # of their number, that their normals add up to at least
 
 
 class Edges(NamedTuple):
-    """Pairs of graphs, numbers 2 i and 2 i + 1, that share an edge.
+    """Graphs that share edges, k of each ball, numbers k i to k i + k − 1.
 
     Attributes:
-        graphs: 2 M. pairs: of points with the graph on whose side they are.
-        cuts: (2 M, 1, 4). valid: (M,) whether they meet at an angle in the ball, and have points.
+        graphs: k M. pairs: of points with the graph on whose side they are.
+        cuts: (k M, 1 or 2, 4). valid: (M,) whether they meet at an angle in the ball, and have points.
+        sure: (M,) whether all have enough of them.
     """
 
     graphs: Graphs
     pairs: Pairs
     cuts: Tensor
     valid: Tensor
+    sure: Tensor
 
 
 def edges_in(
@@ -70,8 +73,9 @@ def edges_in(
     across = across * turned[:, None]
     plane = torch.cat((-across, (across * place).sum(-1, keepdim=True)), 1)
     valid = ((both[:, 0] * both[:, 1]).sum(-1) < _SHARP) & (place.norm(dim=-1) < 1)
-    valid &= torch.bincount(own.ball, minlength=2 * count).reshape(-1, 2).amin(1) >= _EACH
-    return Edges(graphs, own, torch.stack((plane, -plane), 1).reshape(-1, 1, 4), valid)
+    fewest = torch.bincount(own.ball, minlength=2 * count).reshape(-1, 2).amin(1)
+    cuts = torch.stack((plane, -plane), 1).reshape(-1, 1, 4)
+    return Edges(graphs, own, cuts, valid & (fewest >= _FEWEST), fewest >= _ENOUGH[0])
 
 
 def corners_in(
@@ -84,11 +88,13 @@ def corners_in(
     radii: Tensor,
     order: int,
 ) -> Edges:
-    """Three graphs in every ball, 3 i … 3 i + 2, with two planes each, which are found from sides (P,), 0, 1 or 2.
+    """Three graphs in every ball, 4 i … 4 i + 2, with two planes each, which are found from sides (P,), 0, 1 or 2.
 
-    Each is kept on its own side of the planes through its edges, as at an edge: so corners are convex or concave, and
-    others, where one side lies around the other two, are not valid. Points are divided by which graph is nearest; of
-    those further than a slack (M,) on the wrong side of a plane there must be none.
+    Each is kept on its own side of the planes through its edges, as at an edge, if these are all convex or all concave.
+    If one of them is not as the other two, the side between these two lies around the others: it is kept on its own
+    side of either plane, as two graphs that are the same, the second of them 4 i + 3, which elsewhere has no points.
+    Points are divided by which graph is nearest; of those further than a slack (M,) on the wrong side there must be
+    none.
     """
     count, own = len(centers), pairs._replace(ball=3 * pairs.ball + side)
     for turn in range(_ROUNDS):
@@ -96,22 +102,48 @@ def corners_in(
         if turn < _ROUNDS - 1:
             off = [graphs.distances(points[pairs.point], 3 * pairs.ball + k).abs() for k in range(3)]
             own = own._replace(ball=3 * pairs.ball + torch.stack(off).argmin(0))
-    cuts = centers.new_zeros(count, 3, 2, 4)
-    valid = torch.bincount(own.ball, minlength=3 * count).reshape(-1, 3).amin(1) >= _FEWEST
+    fewest = torch.bincount(own.ball, minlength=3 * count).reshape(-1, 3).amin(1)
+    valid = fewest >= _FEWEST
     y, side = (points[pairs.point] - centers[pairs.ball]) / radii[pairs.ball, None], own.ball % 3
-    for i, j in ((0, 1), (1, 2), (2, 0)):
+    planes, convex = [], []
+    for i in range(3):  # of the edge of sides i and i + 1, outside of the first of them
+        j = (i + 1) % 3
         place, both = _edge(graphs[(3 * torch.arange(count)[:, None] + torch.tensor([i, j])).flatten()])
         across = unit(both[:, 0] - both[:, 1])
         height = (across[pairs.ball] * (y - place[pairs.ball])).sum(-1)
-        shared = own.where((side == i) | (side == j))
-        part = 2 * torch.div(shared.ball, 3, rounding_mode="floor") + (shared.ball % 3 == j).long()
-        turned = _turned(height[(side == i) | (side == j)], part, count)
-        beyond = torch.where(side == i, -1.0, torch.where(side == j, 1.0, 0.0)) * height * turned[pairs.ball]
-        plane = turned[:, None] * torch.cat((-across, (across * place).sum(-1, keepdim=True)), 1)
-        cuts[:, i, 0], cuts[:, j, 1] = plane, -plane
+        part = 2 * pairs.ball + (side == j).long()
+        some = side != 3 - i - j
+        turned = _turned(height[some], part[some], count)
+        planes.append(turned[:, None] * torch.cat((-across, (across * place).sum(-1, keepdim=True)), 1))
+        convex.append(turned > 0)
         valid &= ((both[:, 0] * both[:, 1]).sum(-1) < _SHARP) & (place.norm(dim=-1) < 1)
-        valid &= highest(beyond, pairs.ball, count) <= slack / radii
-    return Edges(graphs, own, cuts.flatten(0, 1), valid)
+    cuts = torch.stack([torch.stack((planes[k], -planes[k - 1]), 1) for k in range(3)], 1)
+    around = _around(torch.stack(convex, 1))
+    beyond = plane_distances(y, cuts[pairs.ball, side])
+    beyond = torch.where(around[pairs.ball] == side, beyond.amin(1), beyond.amax(1))
+    valid &= highest(beyond, pairs.ball, count) <= slack / radii
+    return Edges(*_with_fourth(graphs, own, cuts, around), valid, fewest >= _ENOUGH[1])
+
+
+def _around(convex: Tensor) -> Tensor:
+    """Which side (M,) lies around the others, −1 for none, of the edges of sides 0 and 1, 1 and 2, 2 and 0 (M, 3)."""
+    odd = convex != (convex.sum(1, keepdim=True) > 1)
+    return torch.where(odd.any(1), (odd.long().argmax(1) + 2) % 3, -1)
+
+
+def _with_fourth(graphs: Graphs, pairs: Pairs, cuts: Tensor, around: Tensor) -> tuple[Graphs, Pairs, Tensor]:
+    """Four graphs for three of each ball: the fourth is that of the side around, and of their planes each has one."""
+    ball, side = torch.div(pairs.ball, 3, rounding_mode="floor"), pairs.ball % 3
+    again = around[ball] == side
+    number = torch.cat((4 * ball + side, 4 * ball[again] + 3))
+    pairs = Pairs(number, *(torch.cat((x, x[again])) for x in pairs[1:]))
+    given = torch.arange(len(cuts))
+    fourth = 3 * given + around.clamp_min(0)
+    graphs = graphs[torch.cat((torch.arange(3 * len(cuts)).reshape(-1, 3), fourth[:, None]), 1).flatten()]
+    cuts = torch.cat((cuts, cuts[given, around][:, None]), 1)
+    mixed = given[around >= 0]
+    cuts[mixed, around[mixed], 1] = cuts[mixed, 3, 0] = none(cuts)
+    return graphs, pairs, cuts.flatten(0, 1)
 
 
 def by_three_normals(normals: Tensor, pairs: Pairs, count: int) -> tuple[Tensor, Tensor]:
