@@ -191,7 +191,7 @@ def _between(rays: int, ray, low, high, c, stops, close: float) -> list[Truth]:
     start = np.nonzero((v[:-1] * v[1:] < 0) & (own[:-1] == own[1:]))[0]
     end = start + 1
     t = _bisected(c, low, high, (piece[start], x[start]), (piece[end], x[end]), v[start])
-    found = np.split(t, np.searchsorted(own[start], np.arange(1, rays)))
+    found = np.split(t, np.searchsorted(own[start], np.arange(1, rays)))[:rays]  # of no ray no part
     return [Truth(*one) for one in zip(found, undecided.tolist(), strict=True)]
 
 

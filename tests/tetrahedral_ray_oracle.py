@@ -70,9 +70,10 @@ class Polynomials:
     def _of_part(self, cells: np.ndarray, start: np.ndarray, end: np.ndarray, x: np.ndarray) -> np.ndarray:
         at = np.stack((start, end, (start + end) / 2)) - cells - float(self.spline.shift)
         at = np.concatenate((np.ones_like(at[..., :1]), at), -1)  # (3, P, 4)
-        every = (at[2] @ self._table.to_barycentric.reshape(-1, 4).T).reshape(len(cells), -1, 4)
+        table = self._table.to_barycentric
+        every = (at[2] @ table.reshape(-1, 4).T).reshape(len(cells), len(table), 4)
         which = every.min(-1).argmax(-1)
-        a, b = np.einsum("pnc,epc->epn", self._table.to_barycentric[which], at[:2])
+        a, b = np.einsum("pnc,epc->epn", table[which], at[:2])
         place = (1 - x)[:, None] * a[:, None] + x[:, None] * b[:, None]  # (P, M, 4)
         i, j, k = (cells + _MARGIN).T
         return np.einsum("pa,pma->pm", self._coefficients[i, j, k, which], self._basis(place))

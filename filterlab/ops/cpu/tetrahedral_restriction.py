@@ -2,7 +2,7 @@
 
 A cube is looked at first: how near its trend comes to the level along the ray, a quadratic made of 19 samples, and
 between what the spline is off that anywhere in the cube, which was found when the volume was bounded (`ops.bounds`).
-Of three cubes that may hold the level two are left out so (Marschner-Lobb 128³, level ½), and most tetrahedra of the
+Of ten cubes that may hold the level seven are left out so (Marschner-Lobb 128³, level ½), and most tetrahedra of the
 others. In a cube that is left the parts of `ops.cubes` are met in order, one in each lane, until all lanes are through
 or need not go on:
 
