@@ -223,19 +223,18 @@ class Measured:
 
     yardstick: Yardstick
     errors: Mapping[Way, MethodErrors]
-    level: float | None = None
 
     @classmethod
     def of(cls, config: Config, subject: Subject, boundary: Boundary, level: float | None = None) -> Measured:
         """Of all ways."""
         yardstick = Yardstick.of(subject.volume[None], None, boundary, config.seed, level=level)
-        return cls(yardstick, errors_of(yardstick, config.methods, subject.volume.dtype, lambda _: True), level)
+        return cls(yardstick, errors_of(yardstick, config.methods, subject.volume.dtype, lambda _: True))
 
     def answer(self, task: str, budget: float, volume: fl.Volume, costs: Mapping[Way, WayCost]) -> Recommendation:
         """Without limits of memory and time."""
-        boundary = str(self.yardstick.boundary)
-        question = Question(task, budget, math.inf, math.inf, boundary, "refuse", level=self.level)
-        return choose(question, volume, self.yardstick, self.errors, costs)
+        own = self.yardstick
+        question = Question(task, budget, math.inf, math.inf, str(own.boundary), "refuse", level=own.level)
+        return choose(question, volume, own, self.errors, costs)
 
 
 def _judged(
@@ -273,9 +272,9 @@ def _aimed(
 
 def _compared_aimed(aimed: Measured, subject: Subject, truths: Mapping[Way, Truth]) -> dict[str, Any]:
     """Of all of the surface, and what its picture shows."""
-    assert aimed.level is not None
     yardstick, (patch,) = aimed.yardstick, aimed.yardstick.patches
-    surface = subject.on_surface(aimed.level, patch.points, patch.weights)
+    assert yardstick.level is not None
+    surface = subject.on_surface(yardstick.level, patch.points, patch.weights)
     of_surface = truths_of(surface, yardstick.boundary, aimed.errors, yardstick.span)
     shown = {(way[0], way[2]): truth.hit for way, truth in truths.items()}
     ways = _compared(yardstick, aimed.errors, of_surface)

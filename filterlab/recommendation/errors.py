@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
+from filterlab.fields.base import Field
 from filterlab.fields.storage import STORAGE
 from filterlab.methods import reconstruct
 from filterlab.recommendation.calibration import factors
@@ -140,48 +141,30 @@ class Yardstick:
             ValueError: no samples, samples that overflow when fields are evaluated, or a level without a surface.
         """
         value_range = _range(samples)
-        patches = tuple(patches_of(samples, unknown, boundary, SobolEngine(4, scramble=True, seed=seed), level))
         bare = cls(boundary, value_range, level, (), (), {}, 0.0, 0.0, 0.0)
+        drawn = patches_of(samples, unknown, boundary, SobolEngine(4, scramble=True, seed=seed), level)
+        patches, truth = [], []
+        sums, bands = torch.zeros(4, dtype=torch.float64), torch.zeros(BANDS, dtype=torch.float64)
+        for i, patch in enumerate(drawn):
+            scaled = bare._scaled(patch.samples)
+            splines = [endless_spline(scaled, degree) for degree in _DEGREES]
+            if level is not None:
+                patch = _on_surface(patch, splines[0], (level - value_range[0]) / bare.span)
+            if len(patch.points):
+                fine, coarse = (_jet(spline, patch) for spline in splines)
+                patches.append(patch)
+                truth.append(fine[:2])
+                off = [(a - b).flatten(1).square().sum(-1) for a, b in zip(fine[:2], coarse[:2], strict=True)]
+                sums += torch.stack((*off, _along_lines(fine[2] - coarse[2]), _along_lines(fine[2]))) @ patch.weights
+                bands += float(patch.weights.sum()) * band_powers(scaled)
+            tick((i + 1) / len(drawn))
         if level is not None:
-            patches = _of_area(level, [bare._on_surface(patch, level) for patch in patches], value_range)
-        truth, sums, bands = [], torch.zeros(4, dtype=torch.float64), torch.zeros(BANDS, dtype=torch.float64)
-        for i, patch in enumerate(patches):
-            fine, coarse = (bare._jet(patch, degree) for degree in _DEGREES)
-            truth.append(fine[:2])
-            off = [(a - b).flatten(1).square().sum(-1) for a, b in zip(fine[:2], coarse[:2], strict=True)]
-            sums += torch.stack((*off, _along_lines(fine[2] - coarse[2]), _along_lines(fine[2]))) @ patch.weights
-            bands += float(patch.weights.sum()) * band_powers(bare._scaled(patch.samples))
-            tick((i + 1) / len(patches))
+            patches, sums = _of_area(level, patches, sums, value_range)
         *doubts, bend = sums.sqrt().tolist()
         named = dict(zip(("value", "gradient", "bend"), doubts, strict=True))
         rounding = _rounding_of(samples.dtype) * max(map(abs, value_range)) / bare.span
         found = {"doubts": named, "rounding": rounding, "bend": bend, "fall": fall_of(bands)}
-        return replace(bare, patches=patches, truth=tuple(truth), **found)
-
-    def _jet(self, patch: Patch, degree: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Value (P, 1), gradient (P, 3), Hessian (P, 3, 3) of the reference, in parts of the range."""
-        spline = endless_spline(self._scaled(patch.samples), degree)
-        value, gradient, hessian = spline.jet(patch.points.double() + patch.shift, 2)
-        return value[:, None], gradient, hessian
-
-    def _on_surface(self, patch: Patch, level: float) -> Patch:
-        """The points that are near to where the reference is the level, moved there, along the gradient.
-
-        The layer that they were drawn in is as thick everywhere, by the first order: their weights are those of area.
-        """
-        ends = torch.tensor(patch.samples.shape[::-1], dtype=torch.float64) - 1
-        spline, own = (
-            endless_spline(self._scaled(patch.samples), _DEGREES[0]),
-            (level - self.value_range[0]) / self.span,
-        )
-        at, weights = patch.points.double() + patch.shift, patch.weights
-        for _ in range(_MOVES):
-            value, gradient = spline.value_and_gradient(at)
-            off, slope = value - own, gradient.norm(dim=-1)
-            near = (off.abs() <= _LAYER * slope) & (slope > 0)
-            moved = at[near] - (off / slope.square())[near, None] * gradient[near]
-            at, weights = torch.minimum(moved.clamp_min(0), ends), weights[near]
-        return replace(patch, points=(at - patch.shift).float(), weights=weights)
+        return replace(bare, patches=tuple(patches), truth=tuple(truth), **found)
 
     def _scaled(self, x: Tensor) -> Tensor:
         """In parts of the range, float64: nothing under- or overflows when it is squared."""
@@ -260,8 +243,32 @@ def _distance(squares: list[Tensor]) -> Distance:
     return Distance(math.sqrt(total), 0.5 * spread)
 
 
-def _of_area(level: float, patches: Sequence[Patch], value_range: tuple[float, float]) -> tuple[Patch, ...]:
-    """Those that have points on a surface, with weights that add up to 1. Raises ValueError where none has."""
+def _jet(spline: Field, patch: Patch) -> tuple[Tensor, Tensor, Tensor]:
+    """Value (P, 1), gradient (P, 3), Hessian (P, 3, 3) of a reference at the points of a patch."""
+    value, gradient, hessian = spline.jet(patch.points.double() + patch.shift, 2)
+    return value[:, None], gradient, hessian
+
+
+def _on_surface(patch: Patch, spline: Field, level: float) -> Patch:
+    """The points that are near to where the reference is the level, moved there, along the gradient.
+
+    The layer that they were drawn in is as thick everywhere, by the first order: their weights are those of area.
+    """
+    ends = torch.tensor(patch.samples.shape[::-1], dtype=torch.float64) - 1
+    at, weights = patch.points.double() + patch.shift, patch.weights
+    for _ in range(_MOVES):
+        value, gradient = spline.value_and_gradient(at)
+        off, slope = value - level, gradient.norm(dim=-1)
+        near = (off.abs() <= _LAYER * slope) & (slope > 0)
+        moved = at[near] - (off / slope.square())[near, None] * gradient[near]
+        at, weights = torch.minimum(moved.clamp_min(0), ends), weights[near]
+    return replace(patch, points=(at - patch.shift).float(), weights=weights)
+
+
+def _of_area(
+    level: float, patches: Sequence[Patch], sums: Tensor, value_range: tuple[float, float]
+) -> tuple[list[Patch], Tensor]:
+    """The same by weights that add up to 1. Raises ValueError where no patch has a point of the surface."""
     total = math.fsum(float(patch.weights.sum()) for patch in patches)
     if not total > 0:
         low, high = value_range
@@ -269,7 +276,7 @@ def _of_area(level: float, patches: Sequence[Patch], value_range: tuple[float, f
             f"expected a level with a surface in the inner part of the volume, whose samples are {low:.6g} … "
             f"{high:.6g}; got {level:.6g}"
         )
-    return tuple(replace(patch, weights=patch.weights / total) for patch in patches if len(patch.points))
+    return [replace(patch, weights=patch.weights / total) for patch in patches], sums / total
 
 
 def _along_lines(hessian: Tensor) -> Tensor:
